@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.cli import option_values, options
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import add_history_options
 from ehadiag.cli.option_values import add_actuators_options, arguments_of_actuators
 from ehadiag.cli.result_output import (
@@ -112,16 +112,13 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
     option_values.add_bus_options(parser)
     option_values.add_protocol_option(parser)
     add_simulator_options(parser)
-    show_usual(
+    show_help(
         parser,
-        "--test --simulate --fast --FSS --interface --channel --out --report --actuator "
+        "ehadiag bit --test closed --simulate --FSS 0.6",
+        "ehadiag bit --test closed --interface socketcan --channel can0 --report",
+        usual="--test --simulate --fast --FSS --interface --channel --out --report --actuator "
         "--history --help-all",
-        examples=(
-            "ehadiag bit --test closed --simulate --FSS 0.6",
-            "ehadiag bit --test closed --interface socketcan --channel can0 --report",
-        ),
-    )  # fmt: skip
-    parser.set_defaults(run=run_bit)
+    )
 
 
 def run_bit(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.cli import option_values, options
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import add_history_option, append_result, history_path
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.cli.simulator_options import add_simulator_options, simulator_settings
@@ -139,16 +139,13 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
     options.add_screen_options(parser)
     options.add_request_options(parser, "actuator", *options.BUS, "columns", *options.READING)
     option_values.add_bus_options(parser)
-    show_usual(
+    show_help(
         parser,
-        "--interface --channel --port --from --history --actuator --mapping --log-file "
+        "ehadiag monitor --interface socketcan --channel can0 --history fleet.sqlite",
+        "ehadiag monitor --log flight.blf --from results/flight.json",
+        usual="--interface --channel --port --from --history --actuator --mapping --log-file "
         "--record --on-alarm --help-all",
-        examples=(
-            "ehadiag monitor --interface socketcan --channel can0 --history fleet.sqlite",
-            "ehadiag monitor --log flight.blf --from results/flight.json",
-        ),
     )
-    parser.set_defaults(run=run_monitor)
 
 
 def run_monitor(
@@ -299,15 +296,12 @@ def define_check_bus(parser: argparse.ArgumentParser) -> None:
     )
     options.add_request_options(parser, "actuator", *options.BUS, *options.READING)
     option_values.add_bus_options(parser)
-    show_usual(
+    show_help(
         parser,
-        "--interface --channel --port --log --duration --mapping --plot --json --help-all",
-        examples=(
-            "ehadiag check-bus --interface socketcan --channel can0",
-            "ehadiag check-bus --log recording.blf --mapping rig.toml",
-        ),
+        "ehadiag check-bus --interface socketcan --channel can0",
+        "ehadiag check-bus --log recording.blf --mapping rig.toml",
+        usual="--interface --channel --port --log --duration --mapping --plot --json --help-all",
     )
-    parser.set_defaults(run=run_check_bus)
 
 
 def run_check_bus(arguments: argparse.Namespace) -> int:
@@ -360,15 +354,12 @@ def define_replay(parser: argparse.ArgumentParser) -> None:
     )
     options.add_request_options(parser, *options.BUS, *options.READING)
     option_values.add_bus_options(parser)
-    show_usual(
+    show_help(
         parser,
-        "log --interface --channel --port --speed --with-requests --help-all",
-        examples=(
-            "ehadiag replay recording.blf --interface socketcan --channel vcan0",
-            "ehadiag replay recording.blf --interface socketcan --channel vcan0 --speed 2",
-        ),
+        "ehadiag replay recording.blf --interface socketcan --channel vcan0",
+        "ehadiag replay recording.blf --interface socketcan --channel vcan0 --speed 2",
+        usual="log --interface --channel --port --speed --with-requests --help-all",
     )
-    parser.set_defaults(run=run_replay)
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
@@ -428,16 +419,13 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
     option_values.add_bus_options(parser)
     option_values.add_protocol_option(parser)
     add_simulator_options(parser)
-    show_usual(
+    show_help(
         parser,
-        "--interface --channel --port --simulate --script --control --Kintas --FSS --FDJ "
+        "ehadiag sim --interface socketcan --channel vcan0 --FSS 0.6",
+        "ehadiag sim -i virtual -c 1 --simulate scenario.toml --script wear.toml",
+        usual="--interface --channel --port --simulate --script --control --Kintas --FSS --FDJ "
         "--unit --duration --help-all",
-        examples=(
-            "ehadiag sim --interface socketcan --channel vcan0 --FSS 0.6",
-            "ehadiag sim -i virtual -c 1 --simulate scenario.toml --script wear.toml",
-        ),
     )
-    parser.set_defaults(run=run_sim)
 
 
 @contextmanager

@@ -14,13 +14,10 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.cli import options
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.result_output import open_output_folder
 from ehadiag.core.interruption import defer_signals, interrupt_on_signals
-from ehadiag.report.rendering import (
-    calibration_html_page,
-    isolated_png,
-)
+from ehadiag.report.rendering import calibration_html_page, isolated_png
 from ehadiag.terminal.output import (
     TABLE_COLUMNS,
     print_compiling_notice,
@@ -32,13 +29,19 @@ from ehadiag.terminal.output import (
     worst_exit_code,
     write_output,
 )
-from firmware_iface.errors import ConfigurationError, InputOutputError, NotTestedError, reason_of
+from firmware_iface.errors import (
+    ConfigurationError,
+    InputOutputError,
+    NotTestedError,
+    reason_of,
+    valid_text,
+)
 from firmware_iface.files import RESULT_MODE, Folder, write_errors
 from firmware_iface.stored_test import RATE_TOLERANCE, StoredTest, encode_test, resolve_test
 
 if TYPE_CHECKING:
     from ehadiag.calibration.unit_models import Calibrated
-    from ehadiag.core.actuator import Actuator, CalibrationSource
+    from ehadiag.core.actuator import Actuator
     from ehadiag.design.score import MotionLimits, Proposal, Score
     from ehadiag.setup import Setup
     from firmware_iface.recording import Recording
@@ -73,15 +76,12 @@ def define_calibrate(parser: argparse.ArgumentParser) -> None:
     options.add_request_options(parser, "actuator", *options.BUS, *options.READING, "seed")
     options.add_json_option(parser)
     options.add_report_option(parser, "beside the actuator file, also where nothing was learned")
-    show_usual(
+    show_help(
         parser,
-        "logs --out --test --actuator --mapping --update --compare --report --help-all",
-        examples=(
-            "ehadiag calibrate new-open.blf new-closed.blf --out unit.toml --report",
-            "ehadiag calibrate later.blf --actuator unit.toml --update --out unit.toml",
-        ),
+        "ehadiag calibrate new-open.blf new-closed.blf --out unit.toml --report",
+        "ehadiag calibrate later.blf --actuator unit.toml --update --out unit.toml",
+        usual="logs --out --test --actuator --mapping --update --compare --report --help-all",
     )
-    parser.set_defaults(run=run_calibrate)
 
 
 def run_calibrate(arguments: argparse.Namespace) -> int:
@@ -122,17 +122,23 @@ def _write_outputs(
 
     What cannot be written is said, and its exit code added to `codes`.
     """
+    from ehadiag.core.actuator import actuator_toml  # noqa: PLC0415
+    from ehadiag.report.response_signals import calibration_picture  # noqa: PLC0415
+
     written = []
     picture, page = out.with_suffix(".png"), out.with_suffix(".html")
     if found.actuator is not None:
         with report_failure(codes):
-            _write_actuator(folder, out.name, found.actuator, replaced=arguments.update)
+            with write_errors(f"actuator file {folder.path / out.name}"):
+                put = folder.write if arguments.update else folder.write_new
+                put(out.name, actuator_toml(found.actuator))
             written.append(out)
-            _write_picture(folder, picture.name, found)
+            with write_errors(f"picture {folder.path / picture.name}"):
+                folder.write(picture.name, isolated_png(calibration_picture(found)))
             written.append(picture)
     if arguments.report:
-        with report_failure(codes):
-            _write_page(folder, page.name, found)
+        with report_failure(codes), write_errors(f"report {folder.path / page.name}"):
+            folder.write(page.name, calibration_html_page(found))
             written.append(page)
     return written
 
@@ -185,10 +191,15 @@ def _calibrated(
 ) -> Calibrated:
     from ehadiag.assess.diagnosis import match_tests  # noqa: PLC0415 - loads kernels
     from ehadiag.calibration.calibrate_unit import calibrate, update_calibration  # noqa: PLC0415
+    from ehadiag.core.actuator import CalibrationSource  # noqa: PLC0415
 
     start, tests, default = setup.actuator, setup.tests, setup.default
     sources = [
-        _source_of(recording, test.name if test else "", digest)
+        CalibrationSource(
+            name=valid_text(Path(recording.source).name),
+            test=test.name if test else "",
+            sha256=digest,
+        )
         for recording, test, digest in zip(
             recordings, match_tests(recordings, tests, default), digests, strict=True
         )
@@ -206,33 +217,6 @@ def _calibrated(
             seed=setup.request.seed,
             progress=progress,
         )
-
-
-def _source_of(recording: Recording, test: str, digest: str) -> CalibrationSource:
-    from ehadiag.core.actuator import CalibrationSource  # noqa: PLC0415
-    from firmware_iface.errors import valid_text  # noqa: PLC0415
-
-    return CalibrationSource(name=valid_text(Path(recording.source).name), test=test, sha256=digest)
-
-
-def _write_actuator(folder: Folder, name: str, unit: Actuator, *, replaced: bool) -> None:
-    from ehadiag.core.actuator import actuator_toml  # noqa: PLC0415
-
-    with write_errors(f"actuator file {folder.path / name}"):
-        put = folder.write if replaced else folder.write_new
-        put(name, actuator_toml(unit))
-
-
-def _write_picture(folder: Folder, name: str, found: Calibrated) -> None:
-    from ehadiag.report.response_signals import calibration_picture  # noqa: PLC0415
-
-    with write_errors(f"picture {folder.path / name}"):
-        folder.write(name, isolated_png(calibration_picture(found)))
-
-
-def _write_page(folder: Folder, name: str, found: Calibrated) -> None:
-    with write_errors(f"report {folder.path / name}"):
-        folder.write(name, calibration_html_page(found))
 
 
 MAX_TEST_ID = 255
@@ -281,15 +265,12 @@ def define_design(parser: argparse.ArgumentParser) -> None:
         help="number of the better test on the bus, 1 … 255 (default: the test's and 100)",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
-    show_usual(
+    show_help(
         parser,
-        "--test --actuator --out --max-travel --max-rate --max-duration --help-all",
-        examples=(
-            "ehadiag design --test closed",
-            "ehadiag design --test closed --max-travel 5 --out gentle.toml",
-        ),
+        "ehadiag design --test closed",
+        "ehadiag design --test closed --max-travel 5 --out gentle.toml",
+        usual="--test --actuator --out --max-travel --max-rate --max-duration --help-all",
     )
-    parser.set_defaults(run=run_design)
 
 
 def run_design(arguments: argparse.Namespace) -> int:

@@ -89,19 +89,14 @@ class FullHelpAction(argparse.Action):
         parser.exit()
 
 
-def show_examples(parser: argparse.ArgumentParser, *examples: str) -> None:
-    """Let `--help` of a command that has few options end with examples."""
-    assert isinstance(parser, CommandParser)
-    parser.examples = examples
-
-
-def show_usual(parser: argparse.ArgumentParser, usual: str, *, examples: Sequence[str]) -> None:
-    """Let `--help` show the usual options, words of a text, and examples."""
+def show_help(parser: argparse.ArgumentParser, *examples: str, usual: str = "") -> None:
+    """Let `--help` end with examples, and show only the usual options, if any: words of a text."""
     assert isinstance(parser, CommandParser)
     parser.usual, parser.examples = usual.split(), examples
-    parser.add_argument(
-        "--help-all", action=FullHelpAction, nargs=0, help="show all options and exit"
-    )
+    if usual:
+        parser.add_argument(
+            "--help-all", action=FullHelpAction, nargs=0, help="show all options and exit"
+        )
 
 
 def refuse_former_options(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from ehadiag.batch.journal import list_tests
 from ehadiag.batch.workers import LogInput, expand_logs
 from ehadiag.cli import options
 from ehadiag.cli.batch_run import BatchRun, add_batch_options, diagnose_and_deliver
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import add_history_option, add_history_options, history_path
 from ehadiag.cli.option_values import (
     ActuatorArguments,
@@ -32,10 +32,7 @@ from ehadiag.cli.result_output import (
 )
 from ehadiag.core.conventions import fingerprint
 from ehadiag.core.interruption import defer_signals
-from ehadiag.report.rendering import (
-    diagnosis_html_page,
-    index_html_page,
-)
+from ehadiag.report.rendering import diagnosis_html_page, index_html_page
 from ehadiag.request import Request, request_options
 from ehadiag.result import Result, load_result
 from ehadiag.setup import Setup
@@ -70,12 +67,7 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
         f"Diagnose actuators from recordings of their bus ({' '.join(FRAME_READERS)}, and these as"
         " .gz)."
     )
-    parser.add_argument(
-        "logs",
-        nargs="+",
-        metavar="LOG",
-        help=request_options()["logs"].help,
-    )
+    parser.add_argument("logs", nargs="+", metavar="LOG", help=request_options()["logs"].help)
     options.add_request_options(parser, "test", "joint", "every_test")
     parser.add_argument(
         "--list", action="store_true", help="list the tests that each log holds, diagnose none"
@@ -89,16 +81,13 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
     add_history_options(parser)
     options.add_result_options(parser)
     add_batch_options(parser)
-    show_usual(
+    show_help(
         parser,
-        "logs --test --list --out --report --json --actuator --mapping --history --jobs "
+        "ehadiag diagnose recording.blf --out results --report",
+        "ehadiag diagnose recordings/*.blf --jobs 4 --results all.csv",
+        usual="logs --test --list --out --report --json --actuator --mapping --history --jobs "
         "--summary --help-all",
-        examples=(
-            "ehadiag diagnose recording.blf --out results --report",
-            "ehadiag diagnose recordings/*.blf --jobs 4 --results all.csv",
-        ),
     )
-    parser.set_defaults(run=run_diagnose)
 
 
 def run_diagnose(arguments: argparse.Namespace) -> int:
@@ -140,24 +129,16 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
 
 
 def _refuse_diagnose_contradictions(arguments: argparse.Namespace) -> None:
-    several = {
-        "--results": arguments.results,
-        "--resume": arguments.resume,
-        "--junit": arguments.junit,
-        "--summary": arguments.summary,
-        "--cluster": arguments.cluster,
-        "--jobs": arguments.jobs,
-    }
     if arguments.joint and arguments.merge:
         raise ConfigurationError("--merge: with --joint each log is a recording of its own")
     alone = "--joint" if arguments.joint else "--merge" if arguments.merge else ""
-    for name, value in several.items():
-        if alone and value:
-            raise ConfigurationError(f"{name}: {alone} gives one result, and has no use for it")
-    for name in ("--jobs", "--cluster"):
-        if (arguments.report or arguments.signals) and several[name]:
+    for name in ("results", "resume", "junit", "summary", "cluster", "jobs"):
+        if alone and getattr(arguments, name):
+            raise ConfigurationError(f"--{name}: {alone} gives one result, and has no use for it")
+    for name in ("jobs", "cluster"):
+        if (arguments.report or arguments.signals) and getattr(arguments, name):
             option = "--report" if arguments.report else "--signals"
-            raise ConfigurationError(f"{name}: {option} needs samples, which workers do not send")
+            raise ConfigurationError(f"--{name}: {option} needs samples, which workers do not send")
     if arguments.cluster and arguments.jobs:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
 
@@ -253,15 +234,12 @@ def define_report(parser: argparse.ArgumentParser) -> None:
     options.add_request_options(
         parser, "test", "actuator", *options.BUS, *options.READING, *options.LEVELS
     )
-    show_usual(
+    show_help(
         parser,
-        "results --history --test --actuator --mapping --help-all",
-        examples=(
-            "ehadiag report results/recording.json",
-            "ehadiag report results/*.json --history fleet.sqlite",
-        ),
+        "ehadiag report results/recording.json",
+        "ehadiag report results/*.json --history fleet.sqlite",
+        usual="results --history --test --actuator --mapping --help-all",
     )
-    parser.set_defaults(run=run_report)
 
 
 def run_report(arguments: argparse.Namespace) -> int:

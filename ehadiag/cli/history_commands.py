@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.cli.command_parser import show_examples
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import (
     add_history_option,
     add_usage_options,
@@ -65,7 +65,7 @@ def define_history(parser: argparse.ArgumentParser) -> None:
         " file by `bit` and `diagnose`, and never changed."
     )
     add_history_option(parser)
-    show_examples(
+    show_help(
         parser,
         "ehadiag history init --history fleet.sqlite",
         "ehadiag history list --history fleet.sqlite --unit 7",
@@ -131,7 +131,6 @@ def define_history(parser: argparse.ArgumentParser) -> None:
     )
     withdrawn.add_argument("number", type=int, metavar="NUMBER", help="its number, as in list")
     withdrawn.add_argument("text", metavar="TEXT", help='why, such as "of another unit"')
-    parser.set_defaults(run=run_history)
 
 
 def run_history(arguments: argparse.Namespace) -> int:

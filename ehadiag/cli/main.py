@@ -254,8 +254,10 @@ def parser_and_commands(
         module, text = COMMANDS[name]
         made = subparsers.add_parser(name, help=text, allow_abbrev=False)
         if command in (name, None):
-            function = f"define_{name.replace('-', '_')}"
-            getattr(import_module(f"ehadiag.cli.{module}"), function)(made)
+            functions = vars(import_module(f"ehadiag.cli.{module}"))
+            key = name.replace("-", "_")
+            made.set_defaults(run=functions[f"run_{key}"])
+            functions[f"define_{key}"](made)
             made.add_argument(
                 "-v", "--verbose", action="store_true",
                 help="print versions, options in force and their origin, and logs of libraries",

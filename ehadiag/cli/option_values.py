@@ -220,16 +220,12 @@ def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transpor
     from firmware_iface.transport.adapters import BusOptions  # noqa: PLC0415
     from firmware_iface.transport.python_can import PythonCanTransport  # noqa: PLC0415
 
-    options = BusOptions(
-        interface=arguments.interface or "",
-        channel=arguments.channel,
-        bitrate=arguments.bitrate,
-        data_bitrate=arguments.data_bitrate,
-        fd=arguments.fd,
-        app_name=arguments.app_name,
-        extra=_interface_options(arguments.bus_kwargs),
-        allow_multicast=arguments.allow_multicast,
-    )
+    named = {
+        "interface": arguments.interface or "",
+        "extra": _interface_options(arguments.bus_kwargs),
+    }
+    names = BusOptions.__struct_fields__
+    options = BusOptions(**{name: getattr(arguments, name, None) for name in names} | named)
     if arguments.context or not arguments.interface:
         from firmware_iface.transport.adapters import with_configuration  # noqa: PLC0415
 

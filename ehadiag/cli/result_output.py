@@ -11,6 +11,7 @@ import errno
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -234,31 +235,24 @@ class ResultWriter:
         came = defer_signals()
         codes = [result.exit_code]
         with contextlib.suppress(KeyboardInterrupt):
-            written = []
             stem = None
             with report_failure(codes):
                 stem = self._write_json(result, plain_name(name))
             with report_failure(codes):
                 self._keeper.keep(result)
-            if stem is not None:
-                written.append(f"{stem}.json")
+            written = [f"{stem}.json"]
             with report_failure(codes):
                 self._print(result, self._prognosis(result) if alone else None)
-            if stem is not None and draw is not None and self.pictures and not came.is_set():
-                with report_failure(codes):
-                    self._draw(draw, f"{stem}.png")
-                    written.append(f"{stem}.png")
-            if stem is not None and self._arguments.report and not came.is_set():
-                with report_failure(codes):
-                    self._report(result, f"{stem}.html")
-                    written.append(f"{stem}.html")
-            for kind in self._signals if stem is not None and result.can_be_drawn else ():
-                if came.is_set():
-                    break
-                with report_failure(codes):
-                    self._write_signals(result, kind, f"{stem}.signals.{kind}")
-                    written.append(f"{stem}.signals.{kind}")
-            if self._folder is not None and written:
+            if stem is not None and self._folder is not None:
+                for what, suffix, content in self._attachments(result, draw):
+                    if came.is_set():
+                        break
+                    name = f"{stem}{suffix}"
+                    with report_failure(codes):
+                        made = content()
+                        with write_errors(f"{what} {self._folder.path / name}"):
+                            self._folder.write(name, made)
+                        written.append(name)
                 print_status(
                     "wrote " + ", ".join(str(self._folder.path / item) for item in written)
                 )
@@ -364,26 +358,20 @@ class ResultWriter:
             return stem
         raise AssertionError("numbers have no end")
 
-    def _draw(self, draw: Callable[[], bytes], name: str) -> None:
-        assert self._folder is not None
-        content = draw()
-        with write_errors(f"picture {self._folder.path / name}"):
-            self._folder.write(name, content)
+    def _attachments(
+        self, result: Result, draw: Callable[[], bytes] | None
+    ) -> Iterator[tuple[str, str, Callable[[], bytes]]]:
+        """Kind, suffix and content of what stands beside a result."""
+        if draw is not None and self.pictures:
+            yield "picture", ".png", draw
+        if self._arguments.report:
+            levels = Levels(self._arguments.advisory, self._arguments.limit)
+            page = partial(diagnosis_html_page, result, levels, self._keeper.place)
+            yield "report", ".html", page
+        for kind in self._signals if result.can_be_drawn else ():
+            from ehadiag.report.signal_files import signal_file  # noqa: PLC0415 - slow
 
-    def _report(self, result: Result, name: str) -> None:
-        assert self._folder is not None
-        levels = Levels(self._arguments.advisory, self._arguments.limit)
-        page = diagnosis_html_page(result, levels, self._keeper.place)
-        with write_errors(f"report {self._folder.path / name}"):
-            self._folder.write(name, page)
-
-    def _write_signals(self, result: Result, kind: str, name: str) -> None:
-        from ehadiag.report.signal_files import signal_file  # noqa: PLC0415 - slow
-
-        assert self._folder is not None
-        content = signal_file(result, kind)
-        with write_errors(f"signals {self._folder.path / name}"):
-            self._folder.write(name, content)
+            yield "signals", f".signals.{kind}", partial(signal_file, result, kind)
 
 
 def _numbered_stems(name: str) -> Iterator[str]:

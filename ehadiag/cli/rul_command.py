@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import (
     add_history_option,
     add_usage_options,
@@ -69,15 +69,12 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
         parser, "seed", help="seed of the draws (default 0); the same seed, the same answer"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a unit")
-    show_usual(
+    show_help(
         parser,
-        "--unit --all --in --before --history --advisory --limit --json --help-all",
-        examples=(
-            "ehadiag rul --unit 7 --history fleet.sqlite",
-            "ehadiag rul --all --before 200 --history fleet.sqlite",
-        ),
+        "ehadiag rul --unit 7 --history fleet.sqlite",
+        "ehadiag rul --all --before 200 --history fleet.sqlite",
+        usual="--unit --all --in --before --history --advisory --limit --json --help-all",
     )
-    parser.set_defaults(run=run_rul)
 
 
 def run_rul(arguments: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from functools import partial
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import bit_command, bus_commands, option_values, options
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import add_history_options, history_path
 from ehadiag.cli.result_output import open_output_folder
 from ehadiag.request import TEST
@@ -76,16 +76,13 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
     option_values.add_protocol_option(parser)
     add_history_options(parser)
     options.add_request_options(parser, *options.LEVELS)
-    show_usual(
+    show_help(
         parser,
-        "--interface --channel --port --allow-tests --simulate --test --history --out "
+        "ehadiag serve --simulate --allow-tests",
+        "ehadiag serve --interface socketcan --channel can0 --history fleet.sqlite",
+        usual="--interface --channel --port --allow-tests --simulate --test --history --out "
         "--http-port --actuator --help-all",
-        examples=(
-            "ehadiag serve --simulate --allow-tests",
-            "ehadiag serve --interface socketcan --channel can0 --history fleet.sqlite",
-        ),
     )
-    parser.set_defaults(run=run_serve)
 
 
 def run_serve(arguments: argparse.Namespace) -> int:

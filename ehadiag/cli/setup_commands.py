@@ -12,17 +12,12 @@ from importlib import resources
 from pathlib import Path
 
 from ehadiag.cli import options
-from ehadiag.cli.command_parser import show_examples, show_usual
+from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.result_output import OutputFile, open_output_folder, refuse_overwriting
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.request import TEST
-from ehadiag.terminal.output import (
-    print_status,
-    print_text,
-    render_for_terminal,
-    write_output,
-)
+from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
 from firmware_iface.errors import (
     ConfigurationError,
     InputOutputError,
@@ -60,8 +55,7 @@ def define_init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "folder", nargs="?", default=".", metavar="DIR", help="where (default: the working folder)"
     )
-    show_examples(parser, "ehadiag init actuator", "ehadiag init mapping my-bus")
-    parser.set_defaults(run=run_init)
+    show_help(parser, "ehadiag init actuator", "ehadiag init mapping my-bus")
 
 
 def run_init(arguments: argparse.Namespace) -> int:
@@ -94,8 +88,7 @@ def define_tests(parser: argparse.ArgumentParser) -> None:
     """Add description and options of the command."""
     parser.description = "List the stored tests; --csv prints time and command of one."
     parser.add_argument("--csv", metavar=TEST, help="test to print as CSV")
-    show_examples(parser, "ehadiag tests", "ehadiag tests --csv closed")
-    parser.set_defaults(run=run_tests)
+    show_help(parser, "ehadiag tests", "ehadiag tests --csv closed")
 
 
 def run_tests(arguments: argparse.Namespace) -> int:
@@ -174,13 +167,11 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     )
     options.add_request_options(parser, "actuator", "mapping", "dbc", "id_offset")
     options.add_xcp_option(parser, "with --a2l: how the computer is reached")
-    show_usual(
+    show_help(
         parser,
-        "--target --list --out --actuator --hours --fmu --platform --a2l --pdx --help-all",
-        examples=(
-            "ehadiag export --target cortex-m7 --out eha-m7",
-            "ehadiag export --fmu --platform all --out units",
-        ),
+        "ehadiag export --target cortex-m7 --out eha-m7",
+        "ehadiag export --fmu --platform all --out units",
+        usual="--target --list --out --actuator --hours --fmu --platform --a2l --pdx --help-all",
     )
     parser.set_defaults(run=partial(run_export, parser))
 
@@ -271,8 +262,7 @@ def define_warmup(parser: argparse.ArgumentParser) -> None:
         "Compile the model's kernels into the cache folder (EHADIAG_CACHE_DIR, else"
         " the user's cache), so that the first diagnosis does not wait for it."
     )
-    show_examples(parser, "ehadiag warmup", "ehadiag warmup --verbose")
-    parser.set_defaults(run=run_warmup)
+    show_help(parser, "ehadiag warmup", "ehadiag warmup --verbose")
 
 
 def run_warmup(_arguments: argparse.Namespace) -> int:
@@ -308,8 +298,7 @@ def define_completion(parser: argparse.ArgumentParser) -> None:
         " ~/.local/share/bash-completion/completions/ehadiag."
     )
     parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which shell")
-    show_examples(parser, "ehadiag completion bash", "ehadiag completion zsh")
-    parser.set_defaults(run=run_completion)
+    show_help(parser, "ehadiag completion bash", "ehadiag completion zsh")
 
 
 def run_completion(arguments: argparse.Namespace) -> int:

@@ -21,7 +21,7 @@ ConstantValue = Any
 """A number, or an array with one of each candidate, shape (n,)."""
 WALTHER_POINTS = ((40.0, 14.5), (100.0, 3.5))
 """MIL-PRF-83282: temperature (degC), kinematic viscosity (mm²/s) (PHY-19)."""
-(REFERENCE_TEMPERATURE, _), _ = WALTHER_POINTS
+(REFERENCE_TEMPERATURE, _), (_, _) = WALTHER_POINTS
 """degC at which an actuator's viscous coefficients are given (PHY-19)."""
 
 

@@ -77,12 +77,10 @@ def check_ranges(item: Any, kind: str) -> None:
         if "range" in entry.metadata:
             low, high = entry.metadata["range"]
             what = entry.metadata["what"] or f"{kind} {entry.name}"
-            value = getattr(item, entry.name)
-            if isinstance(value, tuple) and len(value) != len(entry.default):
+            value, usual = getattr(item, entry.name), entry.default
+            if isinstance(usual, tuple) and len(value) != len(usual):
                 named = f"{kind} {entry.name.removesuffix('_lsb')}"
-                raise ConfigurationError(
-                    f"{named}: need {len(entry.default)} values, not {len(value)}"
-                )
+                raise ConfigurationError(f"{named}: need {len(usual)} values, not {len(value)}")
             for number in value if isinstance(value, tuple) else (value,):
                 check_within(what, number, low, high)
 

@@ -303,8 +303,7 @@ class XcpSlave:
         return struct.pack("<BHHBB", DYNAMIC_WITH_PRESCALER_AND_STAMPS, len(self._lists), 1, 0, 0)
 
     def _resolution(self, _: bytes) -> bytes:
-        _, unit = event_cycle(CLOCK_STEP_NS)
-        stamp = TIMESTAMP_BYTES | unit << 4
+        stamp = TIMESTAMP_BYTES | event_cycle(CLOCK_STEP_NS)[1] << 4
         return struct.pack("<BBBBBH", 1, MAX_ENTRY_BYTES, 0, 0, stamp, 1)
 
     def _event(self, data: bytes) -> bytes:
