@@ -162,10 +162,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     schema: str = LIVE_SCHEMA
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the snapshot as plain dictionaries, lists, texts and numbers.
-
-        Returns one key for each attribute; texts fit for a terminal.
-        """
+        """Return the snapshot as plain dictionaries, lists, texts and numbers."""
         tree: dict[str, Any] = _printable_tree(msgspec.to_builtins(self))
         return tree
 

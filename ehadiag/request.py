@@ -300,8 +300,7 @@ class Option(msgspec.Struct, frozen=True):
     def read(self, text: str) -> Any:
         """Read one value from the command line.
 
-        text: as it was written. Returns value of the field, or one of several. ValueError: it takes
-        no such value.
+        ValueError: it takes no such value.
         """
         value: Any = text
         if self.kind is int:

@@ -522,10 +522,7 @@ def load_result(path: Path) -> Result:
 
 
 def result_schema() -> dict[str, Any]:
-    """Return the JSON Schema (2020-12) of a result, made from its fields.
-
-    Returns the schema.
-    """
+    """Return the JSON Schema (2020-12) of a result, made from its fields."""
     tree = msgspec.json.schema(Result)
     head = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -105,9 +105,8 @@ class Deadline:
         The caller goes on then, whether or not the function reports its progress. One that is
         left behind ends at its next report.
 
-        work: function, called with the progress report that it is to use; progress: report that
-        this one hands on to. Returns result of the function, whose exceptions are raised here too.
-        NotTestedError: the time is over.
+        work: function, called with the progress report that it is to use. Returns result of the
+        function, whose exceptions are raised here too. NotTestedError: the time is over.
         """
         stages = ["beginning"]
         left_behind = threading.Event()

@@ -208,9 +208,8 @@ class BusMap(msgspec.Struct, frozen=True):
 def default_map(dbc: Path | str | None = None) -> BusMap:
     """Return the default bus (BUS-2, `data/eha_fcc.dbc`), or that of a DBC of the same names.
 
-    dbc: DBC to use instead of the one that comes with the package. Returns the map, checked.
-    InputOutputError: the DBC cannot be read; ConfigurationError: not a DBC, or one of other names
-    than the default mapping's.
+    dbc: DBC to use instead of the one that comes with the package. InputOutputError: the DBC cannot
+    be read; ConfigurationError: not a DBC, or one of other names than the default mapping's.
     """
     folder = Path(__file__).parent / "data"
     where = "bundled mapping eha_fcc.toml"

@@ -26,8 +26,7 @@ from firmware_iface.transport.frames import FrameTable
 def bit_state_text(messages: Mapping[str, Decoded], bus_map: BusMap) -> str:
     """Say what the computer told last of its test.
 
-    messages: decoded messages by name; bus_map: what they mean. Returns one sentence; empty where
-    it told nothing.
+    Returns one sentence; empty where it told nothing.
     """
     lead = bus_map.find("status.state")
     if lead is None or not len(messages[lead[0].name].row):

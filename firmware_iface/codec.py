@@ -300,8 +300,7 @@ class Encoder:
 
         codes: converter codes of current, spool, pressure, position (0 … 4095 of 12 bits); they
         survive decoding exactly where the signals are as fine as the converters; time_ns: time
-        stamp of the frames; counter: counter value; None continues each message's own. Returns the
-        frames of one sample.
+        stamp of the frames; counter: counter value; None continues each message's own.
         """
         raw = {
             key: self._codes[key][int(code)] for key, code in zip(CHANNEL_ROLES, codes, strict=True)
@@ -360,8 +359,7 @@ class Encoder:
     def request(self, code: str | int, test_id: int, time_ns: int = 0) -> tuple[Frame, ...]:
         """Frames that ask for a test: code `start` or `abort`, or its number on the bus.
 
-        code: "start" or "abort"; test_id: number of the test; time_ns: time stamp of the frames,
-        ns. Returns the frames of the request. ConfigurationError: the mapping has no such request.
+        time_ns: time stamp of the frames, ns. ConfigurationError: the mapping has no such request.
         """
         if isinstance(code, str):
             if code not in self._map.requests:

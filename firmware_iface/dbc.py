@@ -237,8 +237,7 @@ def cached_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
 def parse_dbc(text: bytes, name: str) -> Dbc:
     """Messages of a DBC by their name; `name` is the file's, for errors.
 
-    text: contents of the file; name: name of the file, for error messages. Returns messages and
-    signals. ConfigurationError: not a DBC, or too large.
+    ConfigurationError: not a DBC, or too large.
     """
     if len(text) > MAX_DBC_BYTES:
         raise ConfigurationError(f"DBC file {name}: larger than {MAX_DBC_BYTES} bytes")

@@ -29,9 +29,8 @@ def read_small_file(path: Path, limit: int, what: str) -> bytes:
 
     A pipe or a device is refused at once, without waiting for its other end.
 
-    path: file to read; limit: most bytes that it may have; what: its kind, for errors. Returns all
-    of it. InputOutputError: it cannot be read, or is no regular file; ConfigurationError: larger
-    than `limit` bytes.
+    limit: most bytes that it may have; what: its kind, for errors. InputOutputError: it cannot be
+    read, or is no regular file; ConfigurationError: larger than `limit` bytes.
     """
     try:
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

@@ -64,8 +64,7 @@ class LiveDecoder:
     Keeps the last value of each channel, for buses that spread a sample over several messages.
     Telemetry whose counter was just used with another payload is left out, and said to be.
 
-    bus_map: which message and signal plays which role. second_sender: what gives away that somebody
-    else sends as the computer does; empty if nothing.
+    second_sender: what gives away that somebody else sends as the computer does; empty if nothing.
     """
 
     second_sender: str

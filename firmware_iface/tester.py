@@ -150,10 +150,7 @@ class Requester(Protocol):
 
 
 class NativeRequester:
-    """The own messages: requests are frames of the mapping, all else comes unasked.
-
-    bus_map: which message and signal plays which role.
-    """
+    """The own messages: requests are frames of the mapping, all else comes unasked."""
 
     second_sender = ""
     pending = False
@@ -257,16 +254,15 @@ def run_test(
     transport: open; to be closed by the caller; test_id: number of the test; None (listening only):
     any; duration: of the test, s; transmit: request the test, or only listen; recorder: gets every
     frame before anything else does, own requests included; it is closed at the end, whatever
-    happens; bus_map: which message and signal plays which role; limits: values beyond which the
-    test is aborted; None: none; times: time limits of the handshake; None: the defaults; on_frame:
-    gets every frame in order, in the caller's thread; stop: when set, the test is aborted;
-    progress: called with the state of the test as it runs; all_there: asked once, when the computer
-    has said that the test is complete: whether no frame of it may still come, so that there is
-    nothing left to listen for; onboard_wait: how long to listen on, s, for what the computer finds
-    itself, where it says that it is at it; protocol: how the test is requested and watched. Returns
-    how the test ended, and the frames that were recorded. ConfigurationError: `transmit` without a
-    test number or on a transport that listens only, a protocol whose packages are not there;
-    InputOutputError: the recording cannot be written (an abort was requested).
+    happens; limits: values beyond which the test is aborted; None: none; times: time limits of the
+    handshake; None: the defaults; on_frame: gets every frame in order, in the caller's thread;
+    stop: when set, the test is aborted; progress: called with the state of the test as it runs;
+    all_there: asked once, when the computer has said that the test is complete: whether no frame of
+    it may still come, so that there is nothing left to listen for; onboard_wait: how long to listen
+    on, s, for what the computer finds itself, where it says that it is at it. Returns how the test
+    ended, and the frames that were recorded. ConfigurationError: `transmit` without a test number
+    or on a transport that listens only, a protocol whose packages are not there; InputOutputError:
+    the recording cannot be written (an abort was requested).
     """
     if transmit and not transport.transmits:
         raise ConfigurationError(f"{transport.name}: opened to listen only, nothing is sent")

@@ -46,8 +46,7 @@ class _Entry(msgspec.Struct, frozen=True):
 def refuse_taken_identifiers(ids: XcpIds, bus_map: BusMap, *, uds: bool) -> None:
     """Refuse identifiers that the bus has already.
 
-    ids: of the slave; bus_map: meaning of the bus; uds: whether UDS is spoken on it.
-    ConfigurationError: a message, or UDS, has one of them.
+    uds: whether UDS is spoken on it. ConfigurationError: a message, or UDS, has one of them.
     """
     messages = (*bus_map.messages.values(), *bus_map.onboard)
     taken = {(item.can_id, item.extended): f"message {item.name}" for item in messages}
@@ -69,11 +68,10 @@ class XcpTransport(Transport):
     the tick as their counter; those that the computer sends itself are left out. All other frames
     pass. An ODT that is missing loses its tick.
 
-    bus: opened to send; it stays open when this one is closed; bus_map: meaning of the bus;
-    channels: converters of the computer; mode: what the test commands; ids: identifiers of the
-    slave; uds: whether the test is requested by UDS. ConfigurationError: the bus listens only, has
-    commands and channels in messages with other signals, or one of the identifiers;
-    InputOutputError: no slave answers, or it refuses.
+    bus: opened to send; it stays open when this one is closed; channels: converters of the
+    computer; mode: what the test commands; uds: whether the test is requested by UDS.
+    ConfigurationError: the bus listens only, has commands and channels in messages with other
+    signals, or one of the identifiers; InputOutputError: no slave answers, or it refuses.
     """
 
     def __init__(

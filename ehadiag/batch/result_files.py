@@ -309,10 +309,7 @@ MAX_WORST_UNITS = 10
 
 
 class BatchSummary:
-    """Takes each result, and keeps what is told at the end; of a size that does not grow.
-
-    inputs: recordings that were named.
-    """
+    """Takes each result, and keeps what is told at the end; of a size that does not grow."""
 
     def __init__(self, inputs: int) -> None:
         self._inputs = inputs

@@ -170,9 +170,8 @@ class Workers:
         So many are under way at once that the workers are busy, and no more: memory does not grow
         with the number of inputs.
 
-        work: function, which can be sent to another process; inputs: what it is called with;
-        give_up: what stands for an input that ends each process which takes it. Yields one for each
-        input.
+        work: function, which can be sent to another process; give_up: what stands for an input that
+        ends each process which takes it.
         """
         at = 0
         while at < len(inputs):

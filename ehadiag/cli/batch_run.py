@@ -103,10 +103,9 @@ def diagnose_and_deliver(
 ) -> tuple[Result, int]:
     """Diagnose in this process, and deliver the result; return it and its exit code.
 
-    setup: what is wanted; results: where the result goes; recordings: of one actuator; files: that
-    they were read from; logs: log of each; read_s: time of reading, s; name: of the files, without
-    suffix; None: after the log. Returns the code is the verdict's, or 3 where something could not
-    be written and that is worse.
+    recordings: of one actuator; files: that they were read from; read_s: time of reading, s; name:
+    of the files, without suffix; None: after the log. Returns the code is the verdict's, or 3 where
+    something could not be written and that is worse.
     """
     try:
         interrupt_on_signals()
@@ -139,8 +138,7 @@ def _run_task(
     """Read and diagnose one log in a worker; whatever is wrong with it becomes a finding.
 
     setups: what is wanted, of each actuator; folder: working folder of the call, which names of
-    logs start from; task: log and actuator; draw: whether a picture is wanted. Returns at least
-    one.
+    logs start from; task: log and actuator. Returns at least one.
     """
     setup, log = setups[task.unit], task.item.name
     ignore_interrupt_in_worker()
@@ -173,8 +171,7 @@ class _BatchTask(msgspec.Struct, frozen=True):
 class BatchRun:
     """One call that diagnoses each recording by itself.
 
-    arguments: the parsed command line; setups: what is wanted, of each actuator on the bus;
-    results: where each result goes; inputs: the recordings.
+    setups: what is wanted, of each actuator on the bus; results: where each result goes.
     """
 
     def __init__(

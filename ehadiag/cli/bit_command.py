@@ -126,8 +126,7 @@ def run_bit(
 ) -> int:
     """Run the test and print the verdict, or that of each actuator listened to.
 
-    arguments: the parsed command line; snapshots: takes the snapshots instead of the screen.
-    Returns exit code.
+    snapshots: takes the snapshots instead of the screen.
     """
     test = resolve_test(arguments.test)
     setups = _setups(arguments, test)

@@ -153,8 +153,7 @@ def run_monitor(
 ) -> int:
     """Watch until the end, and say how it was.
 
-    arguments: the parsed command line; snapshots: takes the snapshots instead of the screen.
-    Returns exit code.
+    snapshots: takes the snapshots instead of the screen.
     """
     option_values.require_bus_or_log(arguments)
     setup = options.setup_of(arguments)

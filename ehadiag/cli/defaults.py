@@ -62,9 +62,8 @@ class CalledOptions:
     def set(self, key: str, value: Any, where: str) -> bool:
         """Set a default; False where no option is called so.
 
-        key: of the option; value: as a file or a variable has it; where: which file or variable,
-        for errors. Returns whether there is such an option. ConfigurationError: the option takes no
-        such value.
+        value: as a file or a variable has it; where: which file or variable, for errors.
+        ConfigurationError: the option takes no such value.
         """
         done = False
         for parser in self._parsers:
@@ -193,10 +192,9 @@ def apply_defaults(
     `actuator = "left.toml"`, `[diagnose]`, `jobs = 2`. A key is an option's name with `_` or `-`;
     the options of a command's verbs are its own.
 
-    command: which is called; parser: its own, in which a required option is none where it has a
-    default now; given: the command line; commands: makes the parsers of all. Returns what was used,
-    and what was not. ConfigurationError: a key or a value that no option has, a file that others
-    may write to; InputOutputError: a file cannot be read.
+    parser: its own, in which a required option is none where it has a default now; given: the
+    command line; commands: makes the parsers of all. ConfigurationError: a key or a value that no
+    option has, a file that others may write to; InputOutputError: a file cannot be read.
     """
     files = [
         (path, of_project)

@@ -91,10 +91,7 @@ def versions_text() -> str:
 
 
 def print_verbose(arguments: argparse.Namespace) -> None:
-    """Say versions and options, and let what libraries log reach standard error.
-
-    arguments: the parsed command line.
-    """
+    """Say versions and options, and let what libraries log reach standard error."""
     import logging  # noqa: PLC0415 - only who wants to see it
 
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
@@ -230,7 +227,6 @@ def parser_and_commands(
     """Make the parser, and those of the commands.
 
     command: the only one that is wanted; "" or another word: all without their options; None: all.
-    Returns the whole parser, and the commands by name.
     """
     parser: argparse.ArgumentParser = CommandParser(
         prog="ehadiag",

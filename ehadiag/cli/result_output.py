@@ -94,8 +94,7 @@ def refuse_overwriting(
 def refuse_unwritable(outputs: Iterable[OutputFile]) -> None:
     """Refuse a call one of whose outputs is to be in a folder in which nothing can be written.
 
-    outputs: what it will write. InputOutputError: there is no such folder, or no right to write in
-    it.
+    InputOutputError: there is no such folder, or no right to write in it.
     """
     for output in outputs:
         folder = Path(output.name).parent

@@ -93,10 +93,9 @@ def scenario_keys() -> tuple[str, ...]:
 def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the keyword arguments of `ehadiag_sim.emulator.emulated_computer`.
 
-    arguments: the parsed command line. Returns severities, effects, errors of sensors, broken
-    hardware, seed, serial number, changes while it runs and another maker's plant.
-    ConfigurationError: a value out of its range, a key that no scenario has. InputOutputError:
-    scenario or script cannot be read.
+    Returns severities, effects, errors of sensors, broken hardware, seed, serial number, changes
+    while it runs and another maker's plant. ConfigurationError: a value out of its range, a key
+    that no scenario has. InputOutputError: scenario or script cannot be read.
     """
     scenario: Mapping[str, Any] = {}
     where = ""

@@ -60,8 +60,7 @@ def shared_library(code: bytes, names: Sequence[str]) -> bytes:
     """Make a shared library of an object file.
 
     code: the object file: ELF-64 for x86-64 or AArch64; names: functions that are found by their
-    names. Returns the library. ValueError: the object file needs what this linker does not do; the
-    text says what.
+    names. ValueError: the object file needs what this linker does not do; the text says what.
     """
     head = struct.unpack_from(HEADER, code)
     machine, table, size, count = head[2], head[6], head[11], head[12]

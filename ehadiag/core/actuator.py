@@ -360,8 +360,7 @@ def with_tolerance(actuator: Actuator, share: float) -> Actuator:
     """Return the same actuator, the data in which units differ with one tolerance.
 
     actuator: its file's own tolerances do not count; share: the tolerance, 0 … `MAX_TOLERANCE`.
-    Returns as new data. ConfigurationError: the actuator is calibrated: what was found takes the
-    place of tolerances.
+    ConfigurationError: the actuator is calibrated: what was found takes the place of tolerances.
     """
     if actuator.calibration is not None:
         raise ConfigurationError(

@@ -86,8 +86,6 @@ def actuator_channels(actuator: Actuator) -> Channels:
 
     Of one that it leaves out the range of PHY-23 is assumed, or 1.25 times the actuator's reach
     where that is beyond it, in 4096 steps.
-
-    actuator: data of the actuator. Returns ranges and steps.
     """
     return stated_channels((), actuator)
 
@@ -95,8 +93,7 @@ def actuator_channels(actuator: Actuator) -> Channels:
 def stated_channels(stated: tuple[StatedConverter | None, ...], actuator: Actuator) -> Channels:
     """Converters as mapping and actuator file state them, see `actuator_channels`.
 
-    stated: by the mapping, which comes first, of each channel; empty: nothing; actuator: data of
-    the actuator. Returns ranges and steps.
+    stated: by the mapping, which comes first, of each channel; empty: nothing.
     """
     statements = stated or (None,) * len(CHANNELS)
     own = (_filed_channel(actuator, channel) for channel in CHANNELS)
@@ -129,8 +126,7 @@ def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
     which may be coarser than the bus's own, or else the assumed one. A sample is at an end if the
     bus said so, or if it lies at the end of a range that is stated.
 
-    samples: one test; actuator: data of the actuator. Returns converters, and which samples stood
-    at their ends.
+    Returns converters, and which samples stood at their ends.
     """
     statements = samples.stated or (None,) * len(CHANNELS)
     channels, saturated = [], samples.saturated

@@ -65,10 +65,9 @@ def play_stored_test(
 ) -> PlayedTest:
     """Run a test from rest.
 
-    test: what is played; actuator: data of the actuator; severities: in the order of the registry,
-    each 0 … 1; effects: nuisances and errors of data by the registry's names, SI. Returns the
-    answer, without noise but for the fed-back position. ConfigurationError: a severity or an effect
-    out of its range.
+    severities: in the order of the registry, each 0 … 1; effects: nuisances and errors of data by
+    the registry's names, SI. Returns the answer, without noise but for the fed-back position.
+    ConfigurationError: a severity or an effect out of its range.
     """
     # The control law runs here, so the monitor gets currents.
     monitor = Monitor(actuator, severities, mode=CommandMode.CURRENT, effects=effects)
@@ -171,9 +170,8 @@ def score(
     tolerance in the actuator file. The unit has usual nuisances: what hysteresis hides is not
     there to be seen on one without any.
 
-    test: what is scored; actuator: data of the actuator, with their tolerances; points: severities
-    in the order of the registry. Returns the bounds at all points. ConfigurationError: a severity
-    out of its range.
+    actuator: data of the actuator, with their tolerances; points: severities in the order of the
+    registry. ConfigurationError: a severity out of its range.
     """
     played = [play_stored_test(test, actuator, point, typical_effects()) for point in points]
     bounds = tuple(
@@ -429,10 +427,8 @@ def propose(
     An evolution strategy with diagonal adaptation from the best quarter of each generation
     (cross-entropy method, R. Rubinstein, Methodology and Computing in Applied Probability 1, 1999).
 
-    test: where the search begins; actuator: data of the actuator; limits: what no test may exceed;
-    budget: tests to look at; seed: the same seed gives the same test; progress: called after each
-    test with the share of the budget that is spent. Returns None where all tests that were looked
-    at exceed the limits.
+    test: where the search begins; budget: tests to look at; seed: the same seed gives the same
+    test; progress: called after each test with the share of the budget that is spent.
     """
     space = variant_space(test, actuator.controller.IM)
     rng = np.random.default_rng(seed)

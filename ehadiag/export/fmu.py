@@ -317,9 +317,8 @@ def export_fmus(
 
     actuator: whose data are in them as constants; folder: where to write; files of these names are
     replaced; hours: mean time between false alarms of the monitor, h; platforms: names in
-    FMU_PLATFORMS, or "all"; none: this computer. Returns names of the files. ConfigurationError: no
-    such platform, or no C compiler for it; InputOutputError: the folder cannot be written, or the
-    compiler fails.
+    FMU_PLATFORMS, or "all"; none: this computer. ConfigurationError: no such platform, or no C
+    compiler for it; InputOutputError: the folder cannot be written, or the compiler fails.
     """
     compilers = _compilers(platforms)
     tick = 1.0 / actuator.controller.rate

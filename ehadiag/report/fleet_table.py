@@ -64,10 +64,7 @@ def fleet_summary(units: Sequence[FleetUnit]) -> str:
 def fleet_table(
     units: Sequence[FleetUnit], levels: Levels
 ) -> tuple[tuple[str, ...], list[list[Cell]]]:
-    """Return head and lines of the table, worst first, without columns that nothing fills.
-
-    units: in any order; levels: advisory level and limit. Returns names of the columns; cells.
-    """
+    """Return head and lines of the table, worst first, without columns that nothing fills."""
     ordered = sorted(units, key=lambda unit: (WORST_FIRST.index(unit.verdict), -_worst(unit)[1]))
     rows = [_row(unit, levels) for unit in ordered]
     filled = [n for n in range(len(FLEET_HEAD)) if any(row[n].text for row in rows)]

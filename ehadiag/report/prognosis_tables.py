@@ -32,8 +32,7 @@ def print_prognosis(
 ) -> None:
     """Print a prognosis.
 
-    prognosis: what the history says; console: console to print to; before: the next inspection: as
-    it was named, and hours, cycles or days until it.
+    before: the next inspection: as it was named, and hours, cycles or days until it.
     """
     head = f"unit {prognosis.serial}, actuator type {printable(prognosis.actuator or 'unknown')}"
     used = f"{prognosis.used} of {prognosis.diagnoses} diagnoses say {prognosis.unit}"

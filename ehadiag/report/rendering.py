@@ -83,9 +83,8 @@ def index_html_page(
 ) -> bytes:
     """Return a page with a line for each result and a link to its report, as UTF-8.
 
-    results: results with the files of their reports; place: where the page goes; links are relative
-    to it; levels: advisory level and limit; history: health history, for trends and remaining life;
-    None: none is drawn. Returns HTML.
+    place: where the page goes; links are relative to it; history: health history, for trends and
+    remaining life; None: none is drawn.
     """
     from ehadiag.report.fleet_table import (  # noqa: PLC0415
         FleetUnit,

@@ -53,9 +53,8 @@ def diagnosis_page(
 ) -> str:
     """Write the page of a diagnosis.
 
-    result: responses are drawn where its diagnosis is at hand; levels: advisory level and limit;
-    version: of the program; made: when the page is made: UTC, ISO 8601; trend: history of the unit.
-    Returns HTML.
+    result: responses are drawn where its diagnosis is at hand; version: of the program; made: when
+    the page is made: UTC, ISO 8601.
     """
     plots: dict[str, LayoutDOM] = {}
     columns = response_columns(result.diagnosis) if result.at_hand else ()

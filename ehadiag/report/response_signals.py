@@ -71,9 +71,8 @@ def sensed_response(
 ) -> tuple[CurveValues, CurveValues, CurveValues]:
     """Run the model from rest, and read its response by sensors with these errors.
 
-    experiment: the recorded test; constants: of the actuator, with the offsets and gains of its
-    sensors. Returns spool (m), differential pressure (Pa) and jack position (m), shape (ticks,)
-    each.
+    constants: of the actuator, with the offsets and gains of its sensors. Returns spool (m),
+    differential pressure (Pa) and jack position (m), shape (ticks,) each.
     """
     current = experiment.trace.current
     model = model_response(constants, current, experiment.tick, origin=experiment.origin)

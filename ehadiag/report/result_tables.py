@@ -69,9 +69,8 @@ def print_result(
 ) -> None:
     """Print a result: its head, then the numbers.
 
-    result: what was found; console: console to print to; prognosis: of its unit; verbose: the
-    course of the search, reasons in terms of the field, numbers beside no verdict, and every effect
-    that was estimated, not only those that are not 0 beyond doubt.
+    verbose: the course of the search, reasons in terms of the field, numbers beside no verdict, and
+    every effect that was estimated, not only those that are not 0 beyond doubt.
     """
     head = head_of(result, Levels(result.request.advisory, result.request.limit), prognosis)
     _print_head(head, result, console)

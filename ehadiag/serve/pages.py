@@ -54,9 +54,8 @@ REPORT_CONTENT_POLICY = "sandbox allow-scripts"
 class Pages:
     """Makes the page of a path.
 
-    folder: where results and reports go; history: health history; None: none is kept; levels:
-    advisory level and limit; tests: that the page offers to start; simulated: whether tests run on
-    a simulated unit.
+    folder: where results and reports go; history: health history; None: none is kept; tests: that
+    the page offers to start; simulated: whether tests run on a simulated unit.
     """
 
     def __init__(
@@ -79,8 +78,7 @@ class Pages:
     def __call__(self, path: str) -> Page | None:
         """Return the page of a path; None where there is none.
 
-        path: decoded, such as `/history/7`. Returns the page. EhadiagError: the history or a file
-        cannot be read.
+        path: decoded, such as `/history/7`. EhadiagError: the history or a file cannot be read.
         """
         if path == "/session":
             # Made once: a plotting library of a megabyte is in it.

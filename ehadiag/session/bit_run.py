@@ -478,9 +478,8 @@ def listen_for_tests(
 ) -> None:
     """Let several actuators' tests listen to one bus, each in a thread of its own.
 
-    tests: tests that listen; transport: the bus; to be closed by the caller; recorder: gets each
-    frame once; closed at the end; source: name of the recording; stop: ends all; set where one of
-    them fails. EhadiagError: the bus or a listener failed.
+    transport: the bus; to be closed by the caller; recorder: gets each frame once; closed at the
+    end; stop: ends all; set where one of them fails. EhadiagError: the bus or a listener failed.
     """
     from firmware_iface.logs.recorder import SharedBus  # noqa: PLC0415 - loads python-can
 
@@ -532,9 +531,8 @@ def refuse_untestable(
 ) -> None:
     """Refuse a test that could not end in a verdict, before the surface moves.
 
-    test: the stored test; actuator: data of the actuator; bus_map: the bus that will carry the
-    test; transmit: whether the test is to be requested; protocol: how. ConfigurationError:
-    different rates, a bus on which the test cannot be requested, or its end not seen.
+    bus_map: the bus that will carry the test. ConfigurationError: different rates, a bus on which
+    the test cannot be requested, or its end not seen.
     """
     from firmware_iface.handshake import HandshakeAction  # noqa: PLC0415 - loads cantools
     from firmware_iface.tester import requester_of  # noqa: PLC0415 - loads cantools

@@ -69,10 +69,9 @@ class BusMonitor:
     One thread hands over frames, or decoded ticks; another may look at what was found, without a
     lock.
 
-    actuator: its data; bus_map: which message and signal plays which role; unit: its state before;
-    `take_over` exchanges it; tests: tests that the computer may run; hours: mean time between false
-    alarms, h; least: least change of a severity worth an alarm, 1; None: free motion is not tested
-    for changes; on_alarm: called for each alarm that repeats none.
+    unit: its state before; `take_over` exchanges it; tests: tests that the computer may run; hours:
+    mean time between false alarms, h; least: least change of a severity worth an alarm, 1; None:
+    free motion is not tested for changes; on_alarm: called for each alarm that repeats none.
     ConfigurationError: the bus's ticks cannot be told from single frames; hours, least or
     severities out of range.
     """

@@ -131,13 +131,12 @@ def _checked_item(item: DecodedItem) -> DecodedItem:
 class MonitorSession:
     """Reads frames, hands them to the monitor, and its alarms to the outlets.
 
-    actuator: its data; bus_map: which message and signal plays which role; unit: state of the unit
-    before; tests: tests that the computer may run; outlets: where alarms go; hours: mean time
-    between false alarms, h; least: least change of a severity worth an alarm, 1; of_log: whether
-    frames come from a log, whose times alarms then have; bitrate: of the bus, bit/s; None: unknown;
-    find: looks up the state of a unit once the bus has its serial number; None: nothing is looked
-    up; on_alarm: called for each alarm; least_monitored: share of the ticks below which too little
-    was monitored. ConfigurationError: see `BusMonitor`.
+    unit: state of the unit before; tests: tests that the computer may run; outlets: where alarms
+    go; hours: mean time between false alarms, h; least: least change of a severity worth an alarm,
+    1; of_log: whether frames come from a log, whose times alarms then have; bitrate: of the bus,
+    bit/s; None: unknown; find: looks up the state of a unit once the bus has its serial number;
+    None: nothing is looked up; on_alarm: called for each alarm; least_monitored: share of the ticks
+    below which too little was monitored. ConfigurationError: see `BusMonitor`.
     """
 
     def __init__(
@@ -225,10 +224,9 @@ class MonitorSession:
     ) -> MonitorSummary:
         """Watch until stopped, until the time is up, or until the bus or log ends.
 
-        source: where frames or decoded signals come from; stop: ends the session; end_s: longest
-        duration, s; None: no limit; refresh: called after each alarm: readers of snapshots should
-        see it at once. Returns alarms and numbers of ticks. InputOutputError: log or recording
-        cannot be written.
+        source: where frames or decoded signals come from; end_s: longest duration, s; None: no
+        limit; refresh: called after each alarm: readers of snapshots should see it at once. Returns
+        alarms and numbers of ticks. InputOutputError: log or recording cannot be written.
         """
         watcher, outlets, self._source = self.watcher, self._outlets, source
         self._refresh = refresh
@@ -412,9 +410,8 @@ class BitMonitor:
     One thread hands over frames; another may look. An error here does not end the test: `why` has
     it.
 
-    actuator: its data; bus_map: which message and signal plays which role; tests: tests that the
-    computer may run; find: looks up the state of a unit once the bus has its serial number; None:
-    nothing is looked up.
+    tests: tests that the computer may run; find: looks up the state of a unit once the bus has its
+    serial number; None: nothing is looked up.
     """
 
     def __init__(

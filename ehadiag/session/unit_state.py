@@ -57,10 +57,7 @@ class UnitState(msgspec.Struct, frozen=True):
 
 
 def new_unit_state(actuator: Actuator) -> UnitState:
-    """Return the state of a unit without a result: severities 0, effects of its calibration.
-
-    actuator: its file. Returns the unit as new.
-    """
+    """Return the state of a unit without a result: severities 0, effects of its calibration."""
     calibration = actuator.calibration
     if calibration is None:
         source, serial = "a unit as new", None
@@ -97,9 +94,8 @@ def unit_state_of(given: KnownUnit, actuator: Actuator) -> UnitState:
 def unit_state_from_history(path: Path, serial: int, actuator: Actuator) -> UnitState | None:
     """Take the newest diagnosis of a unit that has severities from a health history.
 
-    path: the history; serial: of the unit; actuator: the one that is watched. Returns state by the
-    diagnosis; None where there is none of this unit. ConfigurationError: the file is no history, or
-    the diagnosis one of another actuator.
+    actuator: the one that is watched. Returns state by the diagnosis; None where there is none of
+    this unit. ConfigurationError: the file is no history, or the diagnosis one of another actuator.
     """
     from ehadiag.history.records import counted_entries  # noqa: PLC0415
     from ehadiag.history.store import History  # noqa: PLC0415

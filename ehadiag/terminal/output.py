@@ -268,8 +268,7 @@ TEST_LIST_COLUMNS = ("no.", "test", "start", "length s", "outcome", "serial", "c
 def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) -> None:
     """Print number, test, start, length, outcome, serial number and channel of each test.
 
-    source: name of the recording; tests: its tests, taken one at a time; as_json: one JSON object a
-    line instead of a table.
+    tests: its tests, taken one at a time; as_json: one JSON object a line instead of a table.
     """
     from msgspec.structs import asdict, astuple  # noqa: PLC0415 - not for help texts
 

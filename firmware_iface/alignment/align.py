@@ -65,12 +65,11 @@ def assemble(
 ) -> tuple[Recording, ...]:
     """All tests in a frame table, at least one recording (without samples if none ran).
 
-    table: frames in order of arrival; bus_map: what they mean; source: file or bus, for reports;
-    notes: facts known before decoding; channels: adapter channels on which the actuator's frames
-    came so far; None: in this table; no_status_is_test: take frames without command and status for
-    one test; candidates: what to look for where the bus does not say when which test ran; None: all
-    that is recorded is one test. Returns the tests in order of time; one recording without
-    samples if there is none.
+    table: frames in order of arrival; source: file or bus, for reports; notes: facts known before
+    decoding; channels: adapter channels on which the actuator's frames came so far; None: in this
+    table; no_status_is_test: take frames without command and status for one test; candidates: what
+    to look for where the bus does not say when which test ran; None: all that is recorded is one
+    test.
     """
     present = channels_in(table, bus_map) if channels is None else channels
     channel, ambiguous = choose_channel(bus_map.channel, present)

@@ -222,9 +222,8 @@ def count_frames(
 ) -> MessageCounts:
     """Count what happened to the frames of a message.
 
-    item: its frames; axis: ticks; None without telemetry; episode: the test; begin: rows of the
-    table that belong to the test; end: see `begin`; conflicts: counter values among them that came
-    with different payloads. Returns the counts.
+    axis: ticks; None without telemetry; begin: rows of the table that belong to the test; end: see
+    `begin`; conflicts: counter values among them that came with different payloads.
     """
     received = count_within(item.received, begin, end)
     crc_errors = count_within(item.crc_bad, begin, end)

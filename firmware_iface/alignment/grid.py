@@ -128,8 +128,7 @@ class GridColumn(msgspec.Struct, frozen=True, eq=False):
 def samples_of(grid: TickGrid, mode: CommandMode | None = None) -> tuple[Samples, list[str]]:
     """Put the channels and the commands of one test on its ticks.
 
-    grid: the test and its frames; mode: of the commands to take; None: that of most of them.
-    Returns the samples, and what a reader should know.
+    mode: of the commands to take; None: that of most of them.
     """
     ticks, period = grid.episode.ticks, grid.bus_map.tick_ns
     empty = GridColumn(

@@ -261,8 +261,7 @@ class OnboardReader:
 
     The severities count that come while the computer says that it is done.
 
-    bus_map: which message and signal plays which role. result: the last whole result; None when a
-    later test has begun.
+    result: the last whole result; None when a later test has begun.
     """
 
     result: OnboardResult | None

@@ -507,11 +507,10 @@ def play_log(
     be told to send them. `speed` None sends as fast as the bus takes them. `progress` gets the
     number sent, after every block.
 
-    log: the log's frames, whole or in blocks; transport: the bus to send and receive on; speed: 1:
-    real time; 10: ten times as fast; None: as fast as the bus takes them; stop: set from outside to
-    end early; progress: gets the number sent after every block. Returns number of frames sent.
-    ConfigurationError: the transport was opened to listen only; speed not positive; BusLostError:
-    the bus failed.
+    log: the log's frames, whole or in blocks; speed: 1: real time; 10: ten times as fast; None: as
+    fast as the bus takes them; stop: set from outside to end early; progress: gets the number sent
+    after every block. ConfigurationError: the transport was opened to listen only; speed not
+    positive; BusLostError: the bus failed.
     """
     if speed is not None and not speed > 0:
         raise ConfigurationError(f"speed {speed:g}, need more than 0")

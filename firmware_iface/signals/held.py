@@ -174,10 +174,9 @@ def placed_in_order(
 ) -> PlacedValues:
     """Find the most likely ticks of values, by their currents, arrivals and order.
 
-    events: the values, at least two; expected: what was commanded; noise: of the currents, roughly,
-    A; clock: that of others of the same computer, which tells how the clocks drift; None: their own
-    arrivals do; exact: the values have no noise: what they tell goes before the time. Returns their
-    ticks.
+    events: the values, at least two; noise: of the currents, roughly, A; clock: that of others of
+    the same computer, which tells how the clocks drift; None: their own arrivals do; exact: the
+    values have no noise: what they tell goes before the time.
     """
     least = PLACEMENT.min_noise * noise
     tick, away = _cheapest_path(
@@ -196,8 +195,7 @@ def placed_in_order(
 def placed_by_time(at: FloatArray, clock: ArrivalClock, deviation: float) -> PlacedValues:
     """Find the ticks of values that tell nothing of them, on the clock that others have shown.
 
-    at: when each was seen first, ticks, ascending, shape (n,); clock: of the others; deviation: of
-    their delays, ticks. Returns their ticks.
+    at: when each was seen first, ticks, ascending, shape (n,); deviation: of their delays, ticks.
     """
     phase = clock.at(at)
     empty = np.full(len(at), np.nan)
@@ -401,9 +399,8 @@ def held_by_test(
     """Put held signals on ticks by the tests that were played.
 
     held: signals that keep each value until the next one comes, by role; clock: even ticks whose
-    phase and rate fit the tests roughly; found: the tests on these ticks, at least one; controller:
-    of the actuator. Returns None where no current is among the signals: nothing then tells the
-    ticks.
+    phase and rate fit the tests roughly; found: the tests on these ticks, at least one. Returns
+    None where no current is among the signals: nothing then tells the ticks.
     """
     period = float(clock.begin[-1] - clock.begin[0]) / clock.ticks
     groups = groups_of(held, period)

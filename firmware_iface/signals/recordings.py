@@ -61,10 +61,9 @@ def recordings_of_signals(
 ) -> tuple[Recording, ...]:
     """Read the tests in one recording of decoded signals.
 
-    paths: its files: one, or several that follow or complete one another; columns: which column is
-    what; candidates: the tests that may have been played; budget: what reading may cost. Returns at
-    least one; without a test number where no stored test was found. InputOutputError: a file cannot
-    be read; ConfigurationError: a column is missing, or has a unit that is none of its quantity.
+    paths: its files: one, or several that follow or complete one another. Returns at least one;
+    without a test number where no stored test was found. InputOutputError: a file cannot be read;
+    ConfigurationError: a column is missing, or has a unit that is none of its quantity.
     """
     signals, start, readings = _read_signals(paths, columns, candidates, budget)
     source = ", ".join(str(path) for path in paths)

@@ -70,8 +70,7 @@ class TickClock(msgspec.Struct, frozen=True, eq=False):
 def is_held(signal: RecordedSignal, period: float) -> bool:
     """Whether a signal keeps each value for a whole tick, as one taken from a bus does.
 
-    signal: as recorded; period: length of a tick, s. Returns False of one that is sampled too
-    seldom to show it.
+    period: length of a tick, s. Returns False of one that is sampled too seldom to show it.
     """
     if period / sampling_interval(signal) < HELD.rate:
         return False
@@ -156,8 +155,7 @@ class SignalGroup(msgspec.Struct, frozen=True, eq=False):
 def groups_of(held: Mapping[str, RecordedSignal], period: float) -> list[SignalGroup]:
     """Channels that change together first, then what changes alone.
 
-    held: signals that hold their values, by role; period: length of a tick, s. Returns each role in
-    one of them.
+    held: signals that hold their values, by role; period: length of a tick, s.
     """
     channels = tuple(role for role in held if role.startswith("channels."))
     alone = [role for role in held if role not in channels]
@@ -229,10 +227,9 @@ def on_ticks(
 ) -> tuple[FloatArray, str]:
     """Values of a signal on each tick, and the rule by which they came.
 
-    signal: as recorded; clock: the ticks; period: length of a tick, s; hold: take the value in the
-    middle of a tick, not that at its end: of what the computer holds; lead: time before the ticks'
-    ends whose values are taken, s. Returns NaN where there is none, shape (ticks,); the rule in
-    words, with its error.
+    period: length of a tick, s; hold: take the value in the middle of a tick, not that at its end:
+    of what the computer holds; lead: time before the ticks' ends whose values are taken, s. Returns
+    NaN where there is none, shape (ticks,); the rule in words, with its error.
     """
     step = sampling_interval(signal)
     if hold:
@@ -246,9 +243,8 @@ def on_ticks(
 def usual_lead(signal: RecordedSignal, clock: TickClock, period: float) -> float:
     """Time before the ticks' ends at which a signal was sampled mostly, s.
 
-    signal: as recorded; clock: the ticks; period: length of a tick, s. Returns less than a sampling
-    interval; 0 of so many samples that their mean is taken, and of so few that each goes to the
-    nearest tick.
+    period: length of a tick, s. Returns less than a sampling interval; 0 of so many samples that
+    their mean is taken, and of so few that each goes to the nearest tick.
     """
     step = sampling_interval(signal)
     if not SAMPLING.nearest <= period / step < SAMPLING.averaged:

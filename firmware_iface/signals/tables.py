@@ -104,9 +104,8 @@ class SignalReader(Protocol):
     ) -> dict[str, RecordedSignal]:
         """Read the signals that have a role; `table_signals` does the most of it.
 
-        path: the file, unpacked already; it exists and is not empty; columns: which column is what;
-        budget: bytes and rows that reading may cost; complete: all channels must be in this one
-        file. Returns by role, SI.
+        path: the file, unpacked already; it exists and is not empty; budget: bytes and rows that
+        reading may cost; complete: all channels must be in this one file. Returns by role, SI.
         """
 
 
@@ -294,10 +293,9 @@ def table_signals(
     """Take the signals that have a role out of a table.
 
     table: a data frame of pandas, with the columns that are needed at least; units: units that the
-    file gives, by column; present: names of all columns of the file; columns: which column is what;
-    path: file, for errors; complete: all channels must be there. Returns by role, SI.
-    InputOutputError: without numbers, or time stamps; ConfigurationError: a mapped column is
-    missing, a unit is none of its quantity.
+    file gives, by column; present: names of all columns of the file; path: file, for errors;
+    complete: all channels must be there. Returns by role, SI. InputOutputError: without numbers, or
+    time stamps; ConfigurationError: a mapped column is missing, a unit is none of its quantity.
     """
     import pandas  # noqa: PLC0415 - read by now
 

@@ -130,7 +130,6 @@ class Transport(abc.ABC):
     def receive(self, timeout: float) -> Frame | None:
         """Return the next frame, None when none came within `timeout` s.
 
-        timeout: longest wait, s. Returns the next frame; None if there was none in time.
         BusLostError: the bus failed, now or before, or is closed.
         """
         self._check_usable()
@@ -299,10 +298,7 @@ class Receiver:
         return self._transport.now_ns()
 
     def receive(self, timeout: float) -> Frame | None:
-        """Return the next frame, None when none came within `timeout` s.
-
-        timeout: longest wait, s. Returns the next frame; None if there was none in time.
-        """
+        """Return the next frame, None when none came within `timeout` s."""
         try:
             frame = self._queue.get_nowait() if timeout <= 0 else self._queue.get(timeout=timeout)
         except queue.Empty:

@@ -324,8 +324,7 @@ def _descriptor(bus: can.BusABC) -> int | None:
 def _socket_of(bus: can.BusABC) -> Iterator[socket.socket]:
     """The socket behind an interface, until the block ends.
 
-    bus: the open bus. Yields the socket. NotImplementedError, OSError, AttributeError, TypeError:
-    there is none.
+    NotImplementedError, OSError, AttributeError, TypeError: there is none.
     """
     descriptor = os.dup(bus.fileno())
     try:

@@ -52,8 +52,7 @@ NO_WRITE_TIMEOUT = ("rfc2217://",)
 def packet_of(frame: Frame) -> bytes:
     """Encode one frame with its delimiter.
 
-    frame: the frame to encode. Returns the packet with its delimiter. ConfigurationError: the link
-    carries 11-bit identifiers and payloads of up to 8 bytes only.
+    ConfigurationError: the link carries 11-bit identifiers and payloads of up to 8 bytes only.
     """
     from cobs import cobs  # noqa: PLC0415 - only serial users need it
 

@@ -160,10 +160,9 @@ class UdsClient:
     Stops do not wait for an answer that is due. Any frame on the request identifier that comes from
     the bus is another tester's.
 
-    identifiers: of requests and responses. second_sender: what gives away that somebody else
-    answers as the computer does; empty if nothing; pending: the last frame said that the whole
-    answer to the start takes longer; notes: identification data of the computer after a
-    test, one sentence each.
+    second_sender: what gives away that somebody else answers as the computer does; empty if
+    nothing; pending: the last frame said that the whole answer to the start takes longer; notes:
+    identification data of the computer after a test, one sentence each.
     """
 
     second_sender: str

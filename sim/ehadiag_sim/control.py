@@ -354,8 +354,7 @@ def control_port(control: SimulatorControl, port: int) -> Iterator[int]:
     Each request is a line of JSON, a `Change` such as `{"set": {"FSS": 0.4}, "ramp_s": 2}` or
     `{"get": true}`; each answer is a line, `{"ok": true}`, the values, or `{"error": "..."}`.
 
-    control: of the simulated unit; port: number, 0 … 65535; 0: any free one. Yields the port.
-    ConfigurationError: it is in use, or not allowed.
+    port: number, 0 … 65535; 0: any free one. ConfigurationError: it is in use, or not allowed.
     """
 
     class LineHandler(socketserver.StreamRequestHandler):

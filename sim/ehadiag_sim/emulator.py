@@ -385,14 +385,13 @@ def emulated_computer(
 ) -> FccCore:
     """Return a computer with an actuator that may be broken, its kernels loaded.
 
-    actuator: data of the actuator; tests: tests that the computer stores, each with a number of its
-    own; bus_map: see `FccCore`, as for the parameters that follow; faults: severities of the
-    faults; effects: effects beside the faults; sensors: errors of the converters; broken: kind of
-    broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
-    noise; serial: serial number of the actuator; control, foreign, xcp, protocol: see `FccCore`.
-    Returns the emulated computer; its first tick has the present date, also in simulated time.
-    ConfigurationError: see `FccCore`; an unknown kind of broken hardware, or one that a foreign
-    plant cannot have.
+    tests: tests that the computer stores, each with a number of its own; bus_map: see `FccCore`, as
+    for the parameters that follow; faults: severities of the faults; effects: effects beside the
+    faults; sensors: errors of the converters; broken: kind of broken hardware (`HARDWARE_FAULTS`),
+    its sizes drawn by the seed; None: none; seed: seed of the noise; serial: serial number of the
+    actuator; control, foreign, xcp, protocol: see `FccCore`. Returns the emulated computer; its
+    first tick has the present date, also in simulated time. ConfigurationError: see `FccCore`; an
+    unknown kind of broken hardware, or one that a foreign plant cannot have.
     """
     item = Hardware(actuator, effects or Effects(), sensors or Sensors())
     if broken:
@@ -441,10 +440,9 @@ def run_emulator(
     Ticks have absolute deadlines, so lateness is made up and the rate does not drift. With
     `real_time` false ticks follow at once and only the frames' time stamps tell the time.
 
-    core: the emulated computer; transport: the bus to send and receive on; stop: set from outside
-    to end the loop; real_time: keep to the wall clock, or run as fast as the bus takes frames;
-    on_degraded: called once with the transport's `detail` when it is first degraded; pace: takes
-    how far the computer falls behind. Returns number of ticks run. BusLostError: the bus failed.
+    stop: set from outside to end the loop; real_time: keep to the wall clock, or run as fast as the
+    bus takes frames; on_degraded: called once with the transport's `detail` when it is first
+    degraded; pace: takes how far the computer falls behind. BusLostError: the bus failed.
     """
     period = core.period_ns
     started = time.monotonic_ns()
@@ -477,9 +475,7 @@ def run_emulator(
 def emulator_in_thread(core: FccCore, transport: Transport) -> Iterator[Pace]:
     """Run the computer on a bus in a thread of its own while the block runs.
 
-    core: the emulated computer; transport: the bus to send and receive on. Yields how far
-    the computer falls behind. EhadiagError: the
-    emulator's bus failed meanwhile.
+    Yields how far the computer falls behind. EhadiagError: the emulator's bus failed meanwhile.
     """
     stop = threading.Event()
     failure: list[EhadiagError] = []

@@ -64,8 +64,7 @@ class _DaqList:
 class XcpSlave:
     """Answers the commands of one master, and sends its DAQ lists at the end of each tick.
 
-    measurements: what can be read; ids: identifiers of both directions; period_ns: length of a
-    tick, ns.
+    ids: identifiers of both directions; period_ns: length of a tick, ns.
     """
 
     def __init__(self, measurements: Sequence[Measurement], ids: XcpIds, period_ns: int) -> None:
