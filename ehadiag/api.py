@@ -42,14 +42,7 @@ def compile_kernels(
 ) -> None:
     """Compile the kernels that are needed and not there, several at a time.
 
-    Parameters
-    ----------
-    notify : Callable[[str], None]
-        Is given lines for who waits; none where nothing is compiled.
-    simulation : bool
-        Whether something is simulated.
-    identification : bool
-        Whether something is identified.
+    notify: is given lines for who waits; none where nothing is compiled.
     """
     from ehadiag.compile import libraries  # noqa: PLC0415 - not for help texts
     from ehadiag.compile.sources import cache_folder  # noqa: PLC0415
@@ -111,23 +104,9 @@ def stored_tests_with(given: Iterable[StoredTest | PathLike]) -> tuple[StoredTes
 def resolve_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusMap:
     """Return the meaning of the bus's frames (`load_map`); None: of the computer's own bus.
 
-    Parameters
-    ----------
-    mapping : BusMap | PathLike | None
-        The meaning itself, or a mapping file.
-    dbc : PathLike | None
-        DBC to use instead of the mapping file's own; without a mapping file, one with the default
-        names.
-
-    Returns
-    -------
-    BusMap
-        What each signal is.
-
-    Raises
-    ------
-    ConfigurationError
-        A DBC beside a meaning, or one of other names without a mapping file.
+    mapping: the meaning itself, or a mapping file; dbc: DBC to use instead of the mapping file's
+    own; without a mapping file, one with the default names. ConfigurationError: a DBC beside a
+    meaning, or one of other names without a mapping file.
     """
     from firmware_iface.bus_map import default_map, load_map  # noqa: PLC0415
 

@@ -60,17 +60,7 @@ def learn_as_new(session: CalibrationSession, best: LearnedModel) -> LearnedMode
     further effects that this does not ask for are freed once more, since closed loop may: but not
     where it is so rough that it would ask for any, unless all is unexplained without.
 
-    Parameters
-    ----------
-    session : CalibrationSession
-        The recordings.
-    best : LearnedModel
-        From open loop, with the severities estimated.
-
-    Returns
-    -------
-    LearnedModel
-        With the frictions.
+    best: from open loop, with the severities estimated.
     """
     values = best.estimated.refined.values
     if best.model.by_position:
@@ -201,30 +191,11 @@ def calibrate(
     Data and effects are looked for within their usual sizes (PHY-28 to 37), whatever the start file
     says of tolerances.
 
-    Parameters
-    ----------
-    recordings : Sequence[Recording]
-        Of one unit, as new: at least two.
-    start : Actuator
-        Data of the unit's type.
-    tests : Iterable[StoredTest]
-        Tests that a recording may be of.
-    default : StoredTest | None
-        Test of recordings whose bus does not carry a number.
-    sources : Sequence[CalibrationSource] | None
-        What the file says of each recording; its name and test unless given.
-    compare : bool
-        Try both second stages, each with one play and with a smooth hysteresis, also where the
-        first explains the recordings.
-    seed : int
-        The same seed gives the same answer.
-    progress : CalibrationProgress | None
-        Called with stage and share done.
-
-    Returns
-    -------
-    Calibrated
-        With `reasons` and no actuator where it is refused.
+    recordings: of one unit, as new: at least two; start: data of the unit's type; default: test of
+    recordings whose bus does not carry a number; sources: what the file says of each recording; its
+    name and test unless given; compare: try both second stages, each with one play and with a
+    smooth hysteresis, also where the first explains the recordings; progress: called with stage and
+    share done. Returns with `reasons` and no actuator where it is refused.
     """
     plain = msgspec.structs.replace(start, tolerance=Tolerance(), calibration=None)
     session = CalibrationSession(recordings, plain, tests, default, seed, progress)

@@ -61,16 +61,8 @@ NOTE_HARDLY_SHOWN = "the recordings hardly show it: little is known but its usua
 class LearnedParameters(msgspec.Struct, frozen=True, eq=False):
     """What was learned of the unit's own parameters.
 
-    Attributes
-    ----------
-    parameters : tuple[Parameter, ...]
-        What the unit keeps over its life.
-    values : NDArray[np.float64]
-        SI, data by their relative error, shape (k,).
-    covariance : NDArray[np.float64]
-        Shape (k, k).
-    before : NDArray[np.float64]
-        Deviations of what was known beforehand, shape (k,).
+    values: SI, data by their relative error, shape (k,); covariance: shape (k, k); before:
+    deviations of what was known beforehand, shape (k,).
     """
 
     parameters: tuple[Parameter, ...]

@@ -58,17 +58,8 @@ MIN_SQUARE_EFFECT_CHANGE = 1e-300
 def learn_further_effects(session: CalibrationSession, model: UnitModel) -> LearnedModel:
     """Learn further effects beside those of a model, from open loop.
 
-    Parameters
-    ----------
-    session : CalibrationSession
-        The recordings.
-    model : UnitModel
-        With a smooth hysteresis.
-
-    Returns
-    -------
-    LearnedModel
-        With those that the recordings ask for, or, where that explains more, with all.
+    model: with a smooth hysteresis. Returns with those that the recordings ask for, or, where that
+    explains more, with all.
     """
     best = _learn_effects(session, model, QUICK_EFFECTS, 0)
     if best.estimated.excess <= SEARCHES.max_excess_repeated:
@@ -203,23 +194,8 @@ def select_significant(
 
     Taken out one after the other, the least asked for first, the rest adjusted each time.
 
-    Parameters
-    ----------
-    beside : Sequence[str]
-        Effects that may be left out.
-    names : Sequence[str]
-        All that was estimated.
-    values : NDArray[np.float64]
-        Their estimates, shape (k,).
-    spread : NDArray[np.float64]
-        Their covariance, shape (k, k).
-    worth : float
-        Cost that one unknown must save.
-
-    Returns
-    -------
-    tuple[str, ...]
-        In the order given.
+    beside: effects that may be left out; names: all that was estimated; values: their estimates,
+    shape (k,); spread: their covariance, shape (k, k); worth: cost that one unknown must save.
     """
     left = list(beside)
     while left:
@@ -247,19 +223,7 @@ def choose_model(
     The other second stage is tried where the spool is explained and the pressure is not: the spool
     leaves as much with either.
 
-    Parameters
-    ----------
-    session : CalibrationSession
-        The recordings.
-    start : Actuator
-        Data of the unit's type.
-    compare : bool
-        Try either second stage with one play and with a smooth hysteresis, in any case.
-
-    Returns
-    -------
-    list[LearnedModel]
-        In the order in which they were tried.
+    compare: try either second stage with one play and with a smooth hysteresis, in any case.
     """
     out: list[LearnedModel] = []
     simple = simple_models(start)

@@ -225,15 +225,8 @@ NEARLY_NEW_PRIOR = ParameterPrior(0.02, 0.05)
 class UnitModel(msgspec.Struct, frozen=True):
     """One class of actuator.
 
-    Attributes
-    ----------
-    second_stage : str
-    plays : int
-        Of the hysteresis.
-    beside : tuple[str, ...]
-        Names of the further effects that are estimated.
-    by_position : bool
-        Whether the chambers' volumes follow the jack's travel; of orifices only.
+    plays: of the hysteresis; beside: names of the further effects that are estimated; by_position:
+    whether the chambers' volumes follow the jack's travel; of orifices only.
     """
 
     second_stage: str = "linear"
@@ -293,14 +286,8 @@ class UnitModel(msgspec.Struct, frozen=True):
 class LearnedModel(msgspec.Struct, frozen=True, eq=False):
     """What recordings say if a model holds.
 
-    Attributes
-    ----------
-    model : UnitModel
-    experiments : list[Experiment]
-        Of its class of actuator.
-    estimated : NuisanceEstimate
-    criterion : float
-        Bayesian information criterion (Schwarz, Annals of Statistics 6(2), 1978): less is better.
+    experiments: of its class of actuator; criterion: Bayesian information criterion (Schwarz,
+    Annals of Statistics 6(2), 1978): less is better.
     """
 
     model: UnitModel
@@ -334,37 +321,13 @@ def learn_model(
 ) -> LearnedModel:
     """Estimate all that a model has.
 
-    Parameters
-    ----------
-    model : UnitModel
-        The class of actuator.
-    build : Callable[[Actuator], list[Experiment]]
-        Experiments from an actuator's data.
-    start : Actuator
-        Data of the unit's type.
-    new : bool
-        Take the severities for 0 and estimate the frictions as new; else the severities.
-    nearly_new : bool
-        Look for small severities.
-    hint : Mapping[str, float] | None
-        Values by name beside which the optimum probably lies.
-    hint_of_open : bool
-        Whether these are of the open-loop recordings alone.
-    joint : JointPrior | None
-        What is known of several parameters together.
-    budget : int
-        Runs of the model after which no further start is made.
-    brief : bool
-        Stop early where nothing explains the recordings.
-    seed : int
-        The same seed gives the same answer.
-    tell : Callable[[float], None] | None
-        Called with the share of the budget that is spent.
-
-    Returns
-    -------
-    LearnedModel
-        The optimum, explained or not.
+    build: experiments from an actuator's data; start: data of the unit's type; new: take the
+    severities for 0 and estimate the frictions as new; else the severities; nearly_new: look for
+    small severities; hint: values by name beside which the optimum probably lies; hint_of_open:
+    whether these are of the open-loop recordings alone; joint: what is known of several parameters
+    together; budget: runs of the model after which no further start is made; brief: stop early
+    where nothing explains the recordings; tell: called with the share of the budget that is spent.
+    Returns the optimum, explained or not.
     """
     experiments = share_offsets(
         [

@@ -84,19 +84,7 @@ INTERFACE_DATA = """\
 def a2l_text(actuator: Actuator, bus_map: BusMap, ids: XcpIds) -> str:
     """Return the A2L file of a computer.
 
-    Parameters
-    ----------
-    actuator : Actuator
-        Data of its actuator: converters, and the controller's rate.
-    bus_map : BusMap
-        What it states of converters comes before the actuator file.
-    ids : XcpIds
-        Identifiers of its XCP slave.
-
-    Returns
-    -------
-    str
-        The file, ASCII.
+    bus_map: what it states of converters comes before the actuator file. Returns ASCII.
     """
     measurements = measurements_of(scales_of(bus_map, actuator).channels)
     period_ns = round(1e9 / actuator.controller.rate)

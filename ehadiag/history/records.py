@@ -214,15 +214,7 @@ def counted_entries(entries: Sequence[Entry]) -> list[Entry]:
     A recording that was diagnosed again counts with its last diagnosis alone, also where this took
     several recordings together. Hours and cycles that only an earlier one has are kept.
 
-    Parameters
-    ----------
-    entries : Sequence[Entry]
-        In the order in which they were appended.
-
-    Returns
-    -------
-    list[Entry]
-        A part of them, in the same order.
+    entries: in the order in which they were appended.
     """
     recordings = [_recording_identities(entry) for entry in entries]
     last: dict[str, list[tuple[_RecordingIdentity, Usage]]] = {}
@@ -270,20 +262,10 @@ def continued_usage(
 ) -> tuple[list[Entry], list[MaintenanceEvent], dict[int, Usage]]:
     """Count hours and cycles on where those of a unit that was swapped begin anew.
 
-    Parameters
-    ----------
-    entries : Sequence[Entry]
-        Diagnoses of units of one actuator.
-    events : Sequence[MaintenanceEvent]
-        Their maintenance. After one that renews all severities less than half of the hours before
-        it are those of the new unit; other falls are rounding.
-    names : Collection[str]
-        Of all severities.
-
-    Returns
-    -------
-    tuple[list[Entry], list[MaintenanceEvent], dict[int, Usage]]
-        Both in the same order, and what each serial number's usage was counted on by at last.
+    entries: diagnoses of units of one actuator; events: their maintenance; after one that renews
+    all severities less than half of the hours before it are those of the new unit; other falls are
+    rounding; names: of all severities. Returns both in the same order, and what each serial
+    number's usage was counted on by at last.
     """
     swaps = {id(item) for item in events if is_swap(item, names)}
     if not swaps:
@@ -384,19 +366,8 @@ def current_utc_text() -> str:
 def history_entry(result: Result, usage: Usage, *, simulated: bool) -> Entry:
     """Return what is kept of a result.
 
-    Parameters
-    ----------
-    result : Result
-        What was found.
-    usage : Usage
-        Hours and cycles of the unit when the test was made.
-    simulated : bool
-        Whether the unit is known to be a simulated one.
-
-    Returns
-    -------
-    Entry
-        Not appended yet.
+    usage: of the unit when the test was made; simulated: whether the unit is known to be a
+    simulated one.
     """
     # A name that is not UTF-8 is a file's name only where the recordings are at hand.
     names = [item.source for item in (result.recordings if result.at_hand else result.origins)]

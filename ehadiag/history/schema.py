@@ -148,17 +148,8 @@ def schema_version(connection: sqlite3.Connection) -> int:
 def migrate(connection: sqlite3.Connection, steps: Sequence[str] = MIGRATION_STEPS) -> None:
     """Bring a file to today's tables, whole or not at all; the rows that it has stay as they are.
 
-    Parameters
-    ----------
-    connection : sqlite3.Connection
-        The open file, in autocommit mode.
-    steps : Sequence[str]
-        SQL of each step.
-
-    Raises
-    ------
-    ConfigurationError
-        The file is another program's, or a later version's.
+    connection: in autocommit mode; steps: SQL of each step. ConfigurationError: the file is another
+    program's, or a later version's.
     """
     if _refuse_later(schema_version(connection), steps) == len(steps):
         return
@@ -181,17 +172,8 @@ def migrate(connection: sqlite3.Connection, steps: Sequence[str] = MIGRATION_STE
 def refuse_foreign_schema(connection: sqlite3.Connection, version: int) -> None:
     """Refuse views, triggers and tables that this program has not made: none of them is run.
 
-    Parameters
-    ----------
-    connection : sqlite3.Connection
-        The open file.
-    version : int
-        Steps that it says it has gone through.
-
-    Raises
-    ------
-    ConfigurationError
-        Its tables are not those of its version.
+    version: steps that the file says it has gone through. ConfigurationError: its tables are not
+    those of its version.
     """
     query = "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql NOT NULL"
     query += " AND sql NOT LIKE 'CREATE TABLE sqlite\\_%' ESCAPE '\\'"  # such as ANALYZE makes

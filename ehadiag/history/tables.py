@@ -39,16 +39,8 @@ KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
 def history_csv(entries: Sequence[Entry]) -> str:
     """Write entries as CSV (RFC 4180); one line without a severity where nothing was identified.
 
-    Parameters
-    ----------
-    entries : Sequence[Entry]
-        What is written.
-
-    Returns
-    -------
-    str
-        With a head; empty cells where there is no number. A text that a spreadsheet would take for
-        a formula begins with an apostrophe.
+    Returns with a head; empty cells where there is no number. A text that a spreadsheet would take
+    for a formula begins with an apostrophe.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\r\n")
@@ -61,20 +53,7 @@ def history_csv(entries: Sequence[Entry]) -> str:
 def history_parquet(entries: Sequence[Entry]) -> bytes:
     """Write entries as Parquet with the columns of the CSV file.
 
-    Parameters
-    ----------
-    entries : Sequence[Entry]
-        What is written.
-
-    Returns
-    -------
-    bytes
-        The file.
-
-    Raises
-    ------
-    ConfigurationError
-        pyarrow is not installed.
+    ConfigurationError: pyarrow is not installed.
     """
     try:
         import pyarrow  # noqa: PLC0415 - optional, and slow
@@ -115,24 +94,10 @@ def _cell(value: Any) -> Any:
 def entries_from_csv(text: str, name: str, severities: Sequence[str]) -> list[Entry]:
     """Read diagnoses of another system, in the columns of an exported CSV file.
 
-    Parameters
-    ----------
-    text : str
-        The file. Rows of one number, time, actuator and serial number are one diagnosis.
-    name : str
-        Of the file, for errors.
-    severities : Sequence[str]
-        Names that there are.
-
-    Returns
-    -------
-    list[Entry]
-        Not appended yet; withdrawn rows are left out.
-
-    Raises
-    ------
-    ConfigurationError
-        A column is missing, or a cell is none of its kind.
+    text: rows of one number, time, actuator and serial number are one diagnosis; name: of the file,
+    for errors; severities: names that there are. Returns entries that are not appended yet;
+    withdrawn rows are left out. ConfigurationError: a column is missing, or a cell is none of its
+    kind.
     """
     reader = csv.DictReader(io.StringIO(text, newline=""))
     missing = [item for item in NEEDED_COLUMNS if item not in (reader.fieldnames or ())]

@@ -152,19 +152,8 @@ def _normal_score(chance: Array) -> Array:
 def learn_fleet(lives: Sequence[Life], scale: float, seed: int = 0) -> Fleet:
     """Learn from the lives of a fleet.
 
-    Parameters
-    ----------
-    lives : Sequence[Life]
-        Of one severity.
-    scale : float
-        Age at which the clock stands at 1, hours or cycles.
-    seed : int
-        Of the choice among many lives.
-
-    Returns
-    -------
-    Fleet
-        Only lives that show growth count.
+    lives: of one severity; only those that show growth count; scale: age at which the clock stands
+    at 1, hours or cycles; seed: of the choice among many lives.
     """
     rules, laws = AVERAGING_RULES, draw_laws()
     grown = [_thinned(life) for life in lives if _has_grown(life)]
@@ -256,21 +245,8 @@ class OwnLife(msgspec.Struct, frozen=True, eq=False):
 def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     """Predict the time from a life's last diagnosis to a level.
 
-    Parameters
-    ----------
-    own : OwnLife
-        Of at least two diagnoses, the last one below the level.
-    fleet : Fleet
-        What other lives say.
-    level : float
-        Severity, 1.
-    seed : int
-        Of the draws.
-
-    Returns
-    -------
-    Passage
-        Its distribution, calibrated.
+    own: of at least two diagnoses, the last one below the level; fleet: what other lives say;
+    level: severity, 1. Returns its distribution, calibrated.
     """
     rng, rules = np.random.default_rng(seed), AVERAGING_RULES
     life, filtered = own.life, own.filtered
@@ -555,17 +531,8 @@ def _calibrated(miss: Array, counted: Array, halves: tuple[float, float]) -> Arr
 def surprises(own: OwnLife, fleet: Fleet) -> tuple[Array, Array]:
     """Return how unexpected each diagnosis of a life was, and each one of the fleet.
 
-    Parameters
-    ----------
-    own : OwnLife
-        Of at least two diagnoses.
-    fleet : Fleet
-        What other lives say.
-
-    Returns
-    -------
-    tuple[Array, Array]
-        In deviations of the prediction before it, signed; of the life from its second diagnosis.
+    own: of at least two diagnoses; fleet: what other lives say. Returns deviations of the
+    prediction before it, signed; of the life from its second diagnosis.
     """
     mine = _weighted_surprise(own.filtered, np.zeros((1, len(fleet.laws.law))), fleet)[:, 0]
     if fleet.filtered is None:

@@ -122,27 +122,10 @@ def forecast(
 ) -> Forecast:
     """Forecast one severity of one unit.
 
-    Parameters
-    ----------
-    name : str
-        Of the severity.
-    unit : str
-        `hours`, `cycles` or `days`.
-    life : Life
-        The present one.
-    fleet : Fleet
-        What other lives say.
-    levels : Sequence[float]
-        That are to be reached.
-    seed : int
-        Of the draws; the same seed gives the same digits.
-    elapsed : float
-        Hours, cycles or days since the last diagnosis; nobody knows what was reached in them.
-
-    Returns
-    -------
-    Forecast
-        With a number for each level, or why there is none.
+    unit: `hours`, `cycles` or `days`; life: the present one; fleet: what other lives say; levels:
+    that are to be reached; seed: of the draws; the same seed gives the same digits; elapsed: hours,
+    cycles or days since the last diagnosis; nobody knows what was reached in them. Returns a number
+    for each level, or why there is none.
     """
     found = Forecast(
         name=name,

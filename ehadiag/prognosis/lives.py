@@ -49,25 +49,13 @@ def lives_of(
 ) -> dict[int, list[Life]]:
     """Cut the history of one severity into lives, by unit.
 
-    Parameters
-    ----------
-    entries : Sequence[Entry]
-        Diagnoses that count, of units of one actuator. Those without a verdict, without a serial
-        number, without hours (or cycles) or whose test does not show the severity are left out.
-    events : Sequence[MaintenanceEvent]
-        Maintenance: one that names the severity begins a new life; one that names none does where
-        the severity fell across it. One without hours (or cycles) is placed by its date, right
-        after the last diagnosis before it. Those of another actuator are left out.
-    name : str
-        Of the severity.
-    unit : str
-        One of `USAGE_UNITS`.
-
-    Returns
-    -------
-    dict[int, list[Life]]
-        Lives of each serial number, the present one last; empty ones are left out, but not the
-        present one.
+    entries: diagnoses that count, of units of one actuator. Those without a verdict, without a
+    serial number, without hours (or cycles) or whose test does not show the severity are left out.
+    events: maintenance: one that names the severity begins a new life; one that names none does
+    where the severity fell across it. One without hours (or cycles) is placed by its date, right
+    after the last diagnosis before it. Those of another actuator are left out. unit: one of
+    `USAGE_UNITS`. Returns lives of each serial number, the present one last; empty ones are left
+    out, but not the present one.
     """
     found: dict[int, list[tuple[float, float, float]]] = {}
     dated: dict[int, list[tuple[str, float]]] = {}

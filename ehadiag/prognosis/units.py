@@ -137,39 +137,14 @@ def prognosis_of(
 ) -> Prognosis:
     """Forecast each severity of a unit.
 
-    Parameters
-    ----------
-    serial : int
-        Of the unit.
-    entries : Sequence[Entry]
-        Diagnoses of the unit and its fleet, in the order in which they were appended. Units of the
-        same actuator are the fleet; simulated ones are none of a real unit's.
-    events : Sequence[MaintenanceEvent]
-        Their maintenance events.
-    levels : Sequence[float]
-        That are to be reached, 0 … 1, rising.
-    unit : str | None
-        One of `USAGE_UNITS`; None: the one that more of the unit's diagnoses say.
-    seed : int
-        Of the draws; the same seed gives the same digits.
-    today : Usage | None
-        Hours and cycles of the unit by now; None: by its use a day since its last dated test, where
-        that is known, else those at its last diagnosis.
-    actuator : str | None
-        Of the unit, where its serial number is another actuator's too; None: that of the last
-        diagnosis.
-    now : str | None
-        Day: UTC, ISO 8601; None: today.
-
-    Returns
-    -------
-    Prognosis
-        One forecast for each severity, each with a number or why there is none.
-
-    Raises
-    ------
-    ConfigurationError
-        It is used less today than at its last diagnosis, or in another unit of usage.
+    entries: diagnoses of the unit and its fleet, in the order in which they were appended. Units of
+    the same actuator are the fleet; simulated ones are none of a real unit's. events: their
+    maintenance events; levels, unit, seed: see `prognosis_in`; the same seed gives the same digits;
+    today: hours and cycles of the unit by now; None: by its use a day since its last dated test,
+    where that is known, else those at its last diagnosis; actuator: of the unit, where its serial
+    number is another actuator's too; None: that of the last diagnosis; now: day: UTC, ISO 8601;
+    None: today. ConfigurationError: it is used less today than at its last diagnosis, or in another
+    unit of usage.
     """
     counted = counted_entries(entries)
     own = [i for i in counted if i.serial == serial and actuator in (None, i.actuator)]
@@ -323,25 +298,9 @@ def prognosis_in(
 ) -> Prognosis:
     """Forecast one unit of a history file, here or in another process.
 
-    Parameters
-    ----------
-    path : Path
-        Of the history.
-    levels : Sequence[float]
-        That are to be reached, 0 … 1, rising.
-    unit : str | None
-        One of `USAGE_UNITS`; None: the one that more of the unit's diagnoses say.
-    seed : int
-        Of the draws.
-    now : str
-        Day: UTC, ISO 8601; the same for all units.
-    which : tuple[str, int]
-        Actuator and serial number.
-
-    Returns
-    -------
-    Prognosis
-        Of the unit.
+    levels: that are to be reached, 0 … 1, rising; unit: one of `USAGE_UNITS`; None: the one that
+    more of the unit's diagnoses say; now: day: UTC, ISO 8601; the same for all units; which:
+    actuator and serial number.
     """
     actuator, serial = which
     with History(path) as history:

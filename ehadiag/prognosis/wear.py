@@ -158,23 +158,9 @@ def filter_lives(
 ) -> Filtered:
     """Filter severity and rate of lives by every parameter set.
 
-    Parameters
-    ----------
-    laws : Laws
-        Parameter sets.
-    lives : Sequence[Life]
-        Each of at least one diagnosis.
-    scale : float
-        Age at which the clock stands at 1, hours or cycles.
-    usual : Array
-        Mean rate of lives, shape (lives, sets).
-    deviation : Array
-        Standard deviation of the rate over lives, shape (lives, sets).
-
-    Returns
-    -------
-    Filtered
-        A life's rows after its last diagnosis repeat it.
+    laws: parameter sets; lives: each of at least one diagnosis; scale: age at which the clock
+    stands at 1, hours or cycles; usual, deviation: mean rate of lives, and its standard deviation
+    over them, shape (lives, sets). A life's rows after its last diagnosis repeat it.
     """
     count = np.array([len(life.age) for life in lives])
     longest = int(count.max())
@@ -234,28 +220,10 @@ def draw_passages(
 ) -> Array:
     """Draw the time from each state to a level.
 
-    Parameters
-    ----------
-    laws : Laws
-        Parameter sets.
-    sets : NDArray[np.int64]
-        Set of each draw, shape (draws,).
-    state : tuple[Array, ...]
-        Severity on the scale, rate, their variances and covariance in the order of `Filtered`, and
-        the usual rate; shape (draws,) each.
-    ages : Array
-        Age of each draw, hours or cycles.
-    levels : Array
-        Severity that is to be reached.
-    scale : float
-        Age at which the clock stands at 1.
-    rng : np.random.Generator
-        Of the draws.
-
-    Returns
-    -------
-    Array
-        Hours or cycles; infinite for never.
+    laws: parameter sets; sets: that of each draw, shape (draws,); state: severity on the scale,
+    rate, their variances and covariance in the order of `Filtered`, and the usual rate; shape
+    (draws,) each; ages: of each draw, hours or cycles; levels: severity that is to be reached;
+    scale: age at which the clock stands at 1. Returns hours or cycles; infinite for never.
     """
     level, rate, pzz, pza, paa, usual = state
     pzz, paa = np.maximum(pzz, 0.0), np.maximum(paa, 0.0)

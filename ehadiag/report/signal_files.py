@@ -56,24 +56,8 @@ def signal_library(kind: str) -> ModuleType:
 def signal_file(result: Result, kind: str) -> bytes:
     """Return recorded and modelled signals of a result as a file.
 
-    Parameters
-    ----------
-    result : Result
-        With its recordings at hand.
-    kind : str
-        One of `SIGNAL_FILE_KINDS`.
-
-    Returns
-    -------
-    bytes
-        The file.
-
-    Raises
-    ------
-    ConfigurationError
-        The kind is unknown, or its library is not installed.
-    NotTestedError
-        There are no samples.
+    result: with its recordings at hand; kind: one of `SIGNAL_FILE_KINDS`. ConfigurationError: the
+    kind is unknown, or its library is not installed; NotTestedError: there are no samples.
     """
     if kind not in SIGNAL_FILE_KINDS:
         raise ConfigurationError(f"signals as {kind!r}: need {' or '.join(SIGNAL_FILE_KINDS)}")
