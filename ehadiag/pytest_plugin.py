@@ -13,8 +13,6 @@ import pytest
 if TYPE_CHECKING:
     from ehadiag.result import Result
 
-__all__ = ["ehadiag_bus", "ehadiag_unit", "exceeded_limits"]
-
 LIMITS_MARKER = "ehadiag_limits"
 RunTest = Callable[..., "Result"]
 

@@ -45,12 +45,6 @@ from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import StoredTest
 
-__all__ = [
-    "calibrate",
-    "learn_as_new",
-    "update_calibration",
-]
-
 
 def learn_as_new(session: CalibrationSession, best: LearnedModel) -> LearnedModel:
     """Learn from all recordings, the severities taken for 0 and the frictions as new instead.

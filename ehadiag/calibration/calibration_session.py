@@ -44,17 +44,6 @@ from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import StoredTest
 
-__all__ = [
-    "CalibrationProgress",
-    "CalibrationSession",
-    "LearnedParameters",
-    "RecordingSelection",
-    "calibrated_actuator",
-    "calibrated_values",
-    "learned_parameters",
-]
-
-
 NOTE_HARDLY_SHOWN = "the recordings hardly show it: little is known but its usual size"
 
 

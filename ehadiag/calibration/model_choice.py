@@ -38,17 +38,6 @@ from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.registry import parameter
 from ehadiag.model.residual_models import SimdModel
 
-__all__ = [
-    "QUICK_EFFECTS",
-    "choose_model",
-    "learn_further_effects",
-    "ordered_effects",
-    "relearn_further_effects",
-    "select_significant",
-    "significant_effects",
-]
-
-
 QUICK_EFFECTS = tuple(name for name in FURTHER_EFFECTS if name not in SLOW_EFFECTS)
 TRIAL_SIZES_OF_EFFECT = (0.1, 0.3, 1.0, 2.0)
 """Sizes of an effect over its usual one, 1, that are tried."""

@@ -35,29 +35,6 @@ from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, parameter
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import StoredTest
 
-__all__ = [
-    "CRITERIA",
-    "DATUM_PRIOR",
-    "FURTHER_EFFECTS",
-    "OIL_EFFECTS",
-    "PLAYS_OF_SMOOTH_HYSTERESIS",
-    "SEARCHES",
-    "SECOND_STAGES",
-    "SLOW_EFFECTS",
-    "Calibrated",
-    "CalibratedValue",
-    "LearnedModel",
-    "TriedModel",
-    "UnitModel",
-    "is_explained",
-    "learn_model",
-    "learned_severities",
-    "objections_to_as_new",
-    "objections_to_healthy",
-    "objections_to_model",
-    "simple_models",
-]
-
 
 class CalibratedValue(msgspec.Struct, frozen=True):
     """One thing that was learned of the unit; SI."""

@@ -29,27 +29,6 @@ if TYPE_CHECKING:
     from ehadiag.result import Result
     from firmware_iface.recording import Recording
 
-__all__ = [
-    "DIAGNOSIS_TABLE",
-    "EVENT_TABLE",
-    "Entry",
-    "MaintenanceEvent",
-    "SourceRecord",
-    "Usage",
-    "continued_usage",
-    "counted_entries",
-    "current_utc_text",
-    "entry_object",
-    "event_object",
-    "hash_of_file",
-    "hash_of_samples",
-    "history_entry",
-    "is_swap",
-    "of_unit",
-    "user_history_path",
-]
-
-
 DIAGNOSIS_TABLE, EVENT_TABLE = "diagnosis", "event"
 """Kinds of what can be withdrawn, and their tables."""
 

@@ -13,14 +13,6 @@ from collections.abc import Mapping, Sequence
 
 from firmware_iface.errors import ConfigurationError
 
-__all__ = [
-    "MIGRATION_STEPS",
-    "SQLITE_APPLICATION_ID",
-    "migrate",
-    "refuse_foreign_schema",
-    "schema_version",
-]
-
 SQLITE_APPLICATION_ID = 0x45484148
 """'EHAH' in the file's head: what tells a history from other SQLite files."""
 APPEND_ONLY_TEXT = "a history is only ever appended to"

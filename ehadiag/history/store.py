@@ -36,12 +36,6 @@ if TYPE_CHECKING:
 
     from firmware_iface.recording import Recording
 
-__all__ = [
-    "History",
-    "HistorySnapshot",
-]
-
-
 WRITER_TIMEOUT_S = 30.0
 """Time, s, that one writer waits for the others."""
 MIN_FLEET_UNITS, MAX_FLEET_UNITS = 10, 60

@@ -16,8 +16,6 @@ from ehadiag.estimate import AT_BOUND, INTERVAL_STDS, NOT_SHOWN, Severity
 from ehadiag.history.records import Entry, SourceRecord, Usage, current_utc_text
 from firmware_iface.errors import ConfigurationError, install_command, valid_text
 
-__all__ = ["HISTORY_COLUMNS", "entries_from_csv", "history_csv", "history_parquet"]
-
 HISTORY_COLUMNS: dict[str, type] = {
     "number": int, "when": str, "actuator": str, "serial": int, "hours": float, "cycles": float,
     "test": str, "verdict": str, "severity": str, "estimate": float, "std": float,

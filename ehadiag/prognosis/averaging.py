@@ -28,18 +28,6 @@ from ehadiag.prognosis.wear import (
     mean_rates,
 )
 
-__all__ = [
-    "LIBRARY_NAMES",
-    "POOL_NAME",
-    "Fleet",
-    "OwnLife",
-    "Passage",
-    "filter_own",
-    "learn_fleet",
-    "passage_of",
-    "surprises",
-]
-
 Array = NDArray[np.float64]
 POOL_NAME = "all laws"
 MIN_SEVERITY = 1e-3

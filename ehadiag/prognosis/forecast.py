@@ -15,13 +15,10 @@ from ehadiag.prognosis.averaging import (
     Fleet,
     OwnLife,
     filter_own,
-    learn_fleet,
     passage_of,
     surprises,
 )
 from ehadiag.prognosis.lives import Life
-
-__all__ = ["Forecast", "RemainingLife", "forecast", "learn_fleet"]
 
 
 class ForecastRules(msgspec.Struct, frozen=True):

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from ehadiag.history.records import Entry, MaintenanceEvent
 
-__all__ = ["USAGE_UNITS", "Life", "days_of", "lives_of", "usage_of"]
-
 USAGE_UNITS = ("hours", "cycles", "days")
 """What age is counted in; days are those of the calendar."""
 DAY_S = 86400.0

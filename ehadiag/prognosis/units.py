@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from ehadiag.history.records import Entry, MaintenanceEvent
 
-__all__ = ["Prognosis", "forecast", "prognosis_in", "prognosis_of"]
-
 MIN_DAYS_FOR_DATES = 7.0
 """Days between first and last diagnosis, from which on use a day is known well enough for dates."""
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from ehadiag.prognosis.lives import Life
 
-__all__ = ["LAW_NAMES", "Filtered", "Laws", "draw_laws", "draw_passages", "filter_lives"]
-
 Array = NDArray[np.float64]
 SETS_PER_LAW = 48
 """Number of parameter sets of a law: the study's score changes by less than 1 % beyond it."""
