@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
 
 import msgspec
 
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.actuator import Actuator, actuator_toml, default_actuator, load_actuator
 from ehadiag.request import Request
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.find_test import CandidateTests
@@ -483,7 +483,6 @@ def save_actuator(actuator: Actuator, path: PathLike) -> None:
     InputOutputError
         It cannot be written.
     """
-    from ehadiag.core.actuator import actuator_toml  # noqa: PLC0415 - loads tomli_w
     from firmware_iface.files import write_file  # noqa: PLC0415
 
     write_file(Path(path), actuator_toml(actuator), "actuator file")

@@ -41,6 +41,7 @@ from ehadiag.terminal.output import (
     exit_code_of_inputs,
     print_compiling_notice,
     print_status,
+    print_test_list,
     progress_bar,
     report_failure,
     worst_exit_code,
@@ -199,8 +200,6 @@ def _readable(item: LogInput) -> str:
 def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
     """Print what the logs hold of one actuator."""
     arguments, of = unit.arguments, f" ({unit.label})" if unit.label else ""
-    from ehadiag.terminal.output import print_test_list  # noqa: PLC0415
-
     if unused := [
         name for name in OPTIONS_UNUSED_BY_LIST if getattr(arguments, name) not in UNSET_VALUES
     ]:

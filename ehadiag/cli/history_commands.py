@@ -6,15 +6,16 @@ import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.history_options import (
+    HISTORY_VARIABLE,
     add_history_option,
     add_usage_options,
+    history_path,
     open_named_history,
     units_of,
     usage_from_options,
@@ -22,7 +23,18 @@ from ehadiag.cli.history_options import (
 from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.estimate import INTERVAL_STDS
-from ehadiag.history.records import DIAGNOSIS_TABLE, EVENT_TABLE
+from ehadiag.history.records import (
+    DIAGNOSIS_TABLE,
+    EVENT_TABLE,
+    Entry,
+    MaintenanceEvent,
+    counted_entries,
+    current_utc_text,
+    entry_object,
+    event_object,
+    of_unit,
+    user_history_path,
+)
 from ehadiag.report.head import shown_date
 from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
 from firmware_iface.errors import (
@@ -33,9 +45,6 @@ from firmware_iface.errors import (
     valid_text,
 )
 from firmware_iface.files import read_small_file, write_file
-
-if TYPE_CHECKING:
-    from ehadiag.history.records import Entry, MaintenanceEvent
 
 WITHDRAWABLE_KINDS = (DIAGNOSIS_TABLE, EVENT_TABLE)
 REPLACED_PARTS = {
@@ -160,8 +169,6 @@ def _add_unit(parser: argparse.ArgumentParser, *, required: bool) -> None:
 
 
 def _init(arguments: argparse.Namespace) -> None:
-    from ehadiag.cli.history_options import HISTORY_VARIABLE, history_path  # noqa: PLC0415
-    from ehadiag.history.records import user_history_path  # noqa: PLC0415
     from ehadiag.history.store import History  # noqa: PLC0415
 
     place = history_path(arguments) or user_history_path()
@@ -179,8 +186,6 @@ def _init(arguments: argparse.Namespace) -> None:
 
 
 def _list(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.records import entry_object, event_object  # noqa: PLC0415
-
     entries, events = _read(arguments)
     if arguments.json:
         for entry in entries:
@@ -202,8 +207,6 @@ def _list(arguments: argparse.Namespace) -> None:
 
 
 def _show(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.records import entry_object  # noqa: PLC0415
-
     with open_named_history(arguments) as history:
         found = history.entry(arguments.number)
     print_text(json.dumps(entry_object(found, brief=False), indent=2))
@@ -242,7 +245,6 @@ def _import(arguments: argparse.Namespace) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.records import counted_entries, of_unit  # noqa: PLC0415
     from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415 - slow
     from ehadiag.report.rendering import isolated_png  # noqa: PLC0415
     from ehadiag.report.trend_bus_pictures import has_trend, history_picture  # noqa: PLC0415
@@ -263,10 +265,6 @@ def _plot(arguments: argparse.Namespace) -> None:
 
 
 def _event(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.records import (  # noqa: PLC0415
-        MaintenanceEvent,
-        current_utc_text,
-    )
     from ehadiag.model.registry import FAULT_NAMES  # noqa: PLC0415 - loads numpy
 
     strangers = [name for name in arguments.resets if name not in FAULT_NAMES]
@@ -294,8 +292,6 @@ def _event(arguments: argparse.Namespace) -> None:
 
 
 def _withdraw(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.records import current_utc_text  # noqa: PLC0415
-
     kind, number, text = arguments.kind, arguments.number, valid_text(arguments.text)
     with open_named_history(arguments) as history:
         history.withdraw(kind, number, current_utc_text(), text)
@@ -315,7 +311,6 @@ def _when(text: str) -> str:
 
 def _read(arguments: argparse.Namespace) -> tuple[list[Entry], list[MaintenanceEvent]]:
     """Read the unit that was named, or all; what counts, or all."""
-    from ehadiag.history.records import counted_entries  # noqa: PLC0415
 
     whole, serial, kind = arguments.all, arguments.unit, arguments.actuator
     with open_named_history(arguments) as history:
