@@ -21,6 +21,7 @@ import msgspec
 from ehadiag.core.actuator import Actuator, actuator_toml, default_actuator, load_actuator
 from ehadiag.request import Request
 from firmware_iface.errors import ConfigurationError
+from firmware_iface.files import write_file
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import StoredTest, bundled_tests, resolve_test
@@ -483,8 +484,6 @@ def save_actuator(actuator: Actuator, path: PathLike) -> None:
     InputOutputError
         It cannot be written.
     """
-    from firmware_iface.files import write_file  # noqa: PLC0415
-
     write_file(Path(path), actuator_toml(actuator), "actuator file")
 
 

@@ -14,21 +14,18 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import msgspec
 
+from ehadiag.api import PathLike
 from ehadiag.core.conventions import MAX_RESULT_BYTES, __version__, fingerprint, start_text
 from ehadiag.records import configuration_of, package
 from ehadiag.result import Configuration, ListedTest, Log, Result
-from ehadiag.setup import Setup, log_of
+from ehadiag.setup import Progress, Setup, log_of
 from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.files import RESULT_MODE, Folder, create_file, private_folder, reopen_file
-
-if TYPE_CHECKING:
-    from ehadiag.api import PathLike
-    from ehadiag.setup import Progress
-    from firmware_iface.recording import Recording
+from firmware_iface.recording import Recording
 
 
 @contextmanager

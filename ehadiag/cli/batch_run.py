@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -46,9 +46,7 @@ from ehadiag.terminal.output import (
     worst_exit_code,
 )
 from firmware_iface.errors import EhadiagError, InputOutputError
-
-if TYPE_CHECKING:
-    from firmware_iface.recording import Recording
+from firmware_iface.recording import Recording
 
 MIN_RECORDINGS_FOR_SUMMARY = 5
 """Recordings from which on a summary is told unasked."""

@@ -16,6 +16,7 @@ import msgspec
 from ehadiag.cli import options
 from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.result_output import open_output_folder
+from ehadiag.core.actuator import CalibrationSource, actuator_toml
 from ehadiag.core.interruption import defer_signals, interrupt_on_signals
 from ehadiag.report.rendering import calibration_html_page, isolated_png
 from ehadiag.terminal.output import (
@@ -122,7 +123,6 @@ def _write_outputs(
 
     What cannot be written is said, and its exit code added to `codes`.
     """
-    from ehadiag.core.actuator import actuator_toml  # noqa: PLC0415
     from ehadiag.report.response_signals import calibration_picture  # noqa: PLC0415
 
     written = []
@@ -191,7 +191,6 @@ def _calibrated(
 ) -> Calibrated:
     from ehadiag.assess.diagnosis import match_tests  # noqa: PLC0415 - loads kernels
     from ehadiag.calibration.calibrate_unit import calibrate, update_calibration  # noqa: PLC0415
-    from ehadiag.core.actuator import CalibrationSource  # noqa: PLC0415
 
     start, tests, default = setup.actuator, setup.tests, setup.default
     sources = [

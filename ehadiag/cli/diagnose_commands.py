@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -34,7 +33,7 @@ from ehadiag.core.conventions import fingerprint
 from ehadiag.core.interruption import defer_signals
 from ehadiag.report.rendering import diagnosis_html_page, index_html_page
 from ehadiag.request import Request, request_options
-from ehadiag.result import Result, load_result
+from ehadiag.result import Log, Result, load_result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     counting_bar,
@@ -49,10 +48,7 @@ from ehadiag.terminal.output import (
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
 from firmware_iface.files import write_file
 from firmware_iface.logs.log_files import FRAME_READERS
-
-if TYPE_CHECKING:
-    from ehadiag.result import Log
-    from firmware_iface.recording import Recording
+from firmware_iface.recording import Recording
 
 OPTIONS_UNUSED_BY_LIST = (
     "joint", "out", "report", "signals", "history", "hours", "cycles", "results", "resume",

@@ -22,6 +22,7 @@ from ehadiag.cli.history_options import (
 )
 from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
+from ehadiag.core.conventions import utc_time_text
 from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.history.records import (
     DIAGNOSIS_TABLE,
@@ -36,6 +37,7 @@ from ehadiag.history.records import (
     user_history_path,
 )
 from ehadiag.report.head import shown_date
+from ehadiag.report.rendering import isolated_png
 from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
 from firmware_iface.errors import (
     ConfigurationError,
@@ -246,7 +248,6 @@ def _import(arguments: argparse.Namespace) -> None:
 
 def _plot(arguments: argparse.Namespace) -> None:
     from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415 - slow
-    from ehadiag.report.rendering import isolated_png  # noqa: PLC0415
     from ehadiag.report.trend_bus_pictures import has_trend, history_picture  # noqa: PLC0415
 
     levels = Levels()
@@ -299,8 +300,6 @@ def _withdraw(arguments: argparse.Namespace) -> None:
 
 
 def _when(text: str) -> str:
-    from ehadiag.core.conventions import utc_time_text  # noqa: PLC0415
-
     try:
         return utc_time_text(text)
     except ValueError:

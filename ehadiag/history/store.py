@@ -13,8 +13,9 @@ import stat
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import msgspec
 
@@ -30,11 +31,7 @@ from ehadiag.history.records import (
 from ehadiag.history.schema import MIGRATION_STEPS, migrate, refuse_foreign_schema, schema_version
 from ehadiag.result import Result
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError, reason_of
-
-if TYPE_CHECKING:
-    from os import PathLike
-
-    from firmware_iface.recording import Recording
+from firmware_iface.recording import Recording
 
 WRITER_TIMEOUT_S = 30.0
 """Time, s, that one writer waits for the others."""

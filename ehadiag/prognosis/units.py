@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -14,6 +14,8 @@ from msgspec.structs import replace
 from ehadiag.assess.verdict import Levels
 from ehadiag.core.criteria import VERDICT
 from ehadiag.history.records import (
+    Entry,
+    MaintenanceEvent,
     Usage,
     continued_usage,
     counted_entries,
@@ -26,11 +28,6 @@ from ehadiag.prognosis.forecast import Forecast, RemainingLife
 from ehadiag.prognosis.forecast import forecast as severity_forecast
 from ehadiag.prognosis.lives import USAGE_UNITS, Life, days_of, lives_of, usage_of
 from firmware_iface.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from os import PathLike
-
-    from ehadiag.history.records import Entry, MaintenanceEvent
 
 MIN_DAYS_FOR_DATES = 7.0
 """Days between first and last diagnosis, from which on use a day is known well enough for dates."""

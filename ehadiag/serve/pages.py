@@ -8,18 +8,19 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from markupsafe import Markup
 from msgspec import structs
 
-from ehadiag.assess.verdict import Verdict
+from ehadiag.assess.verdict import Levels, Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
-from ehadiag.history.records import counted_entries, of_unit
+from ehadiag.estimate import Severity
+from ehadiag.history.records import Entry, MaintenanceEvent, counted_entries, of_unit
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag.prognosis.units import prognosis_of
+from ehadiag.prognosis.units import Prognosis, prognosis_of
 from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
 from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table, levels_text
 from ehadiag.report.head import (
@@ -38,12 +39,6 @@ from ehadiag.serve.server import Page
 from firmware_iface import FREE_MOTION
 from firmware_iface.errors import EhadiagError, printable
 from firmware_iface.files import read_small_file
-
-if TYPE_CHECKING:
-    from ehadiag.assess.verdict import Levels
-    from ehadiag.estimate import Severity
-    from ehadiag.history.records import Entry, MaintenanceEvent
-    from ehadiag.prognosis.units import Prognosis
 
 MAX_PAGE_ROWS = 500
 """Of a list, newest first."""
