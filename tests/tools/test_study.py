@@ -97,7 +97,7 @@ def test_a_report_is_printed_and_written(
 def test_exit_codes_tell_failure_error_and_interruption(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_study(replace(STUDY, failed=lambda records: len(records) == 4), options(tmp_path))
+    assert run_study(replace(STUDY, failed=lambda record: record["square"] == 9), options(tmp_path))
     for study, code, words in (
         (replace(STUDY, cases=refuse), 2, "squares: no number"),
         (replace(STUDY, perform=interrupt, name="other"), 130, "goes on from"),

@@ -48,7 +48,7 @@ class Study(Generic[C]):
     `cases` are those that the command line asks for; `perform`, a function of a module so that
     worker processes find it, performs one; `report` makes lines of Markdown of all records in the
     order of the cases. `count` is the default of `--cases`, None where their number is given;
-    `counted` what that option counts. `failed` records make the exit code 1. A study that
+    `counted` what that option counts. A record that `failed` makes the exit code 1. A study that
     `measures_time` of this machine performs its cases one at a time, and keeps nothing.
     """
 
@@ -60,7 +60,7 @@ class Study(Generic[C]):
     add_options: Callable[[argparse.ArgumentParser], None] = lambda _parser: None
     count: int | None = 200
     counted: str = "random cases"
-    failed: Callable[[Sequence[Record]], bool] = lambda _records: False
+    failed: Callable[[Record], bool] = lambda _record: False
     measures_time: bool = False
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -89,7 +89,7 @@ def run_study(study: Study[Any], options: Options) -> int:
         cases = study.cases(options)
         records = perform_cases(study, cases, kept, getattr(options, "jobs", 1))
         _write_report(study.report(records, options), options.output)
-        return int(study.failed(records))
+        return int(any(map(study.failed, records)))
     except EhadiagError as error:
         print(f"{study.name}: {error}", file=sys.stderr)
         return error.exit_code

@@ -462,10 +462,6 @@ def _hardware_cells(records: Sequence[Record]) -> list[str]:
     return [*counts, str(wrong), f"{np.median(times):.2f}", f"{max(times):.2f}"]
 
 
-def _any_not_allowed(records: Sequence[Record]) -> bool:
-    return any(item["not_allowed"] for item in records)
-
-
 ALARMS = Study(
     "alarms",
     "False and missed alarms of random units that are calibrated once and tested often.",
@@ -486,5 +482,5 @@ HARDWARE = Study(
     "hardware",
     "Verdicts on every kind of broken hardware that the simulator plays; 1 if one is not allowed.",
     _hardware_cases, perform_broken, hardware_report, _hardware_options, count=20,
-    counted="of each kind and test", failed=_any_not_allowed,
+    counted="of each kind and test", failed=lambda item: bool(item["not_allowed"]),
 )  # fmt: skip

@@ -142,7 +142,7 @@ def _move(
 SENSOR_PLACES = {"current": 0, "spool": 1, "pressure": 2, "position": 3}
 
 
-def free_motion(actuator: Actuator, motion: Motion, step: float = STEP) -> MotionRecord:
+def free_motion(actuator: Actuator, motion: Motion) -> MotionRecord:
     """Move a simulated actuator from rest, see `Motion`."""
     mode = CommandMode[motion.mode.upper()]
     rate, closed = actuator.controller.rate, mode is CommandMode.POSITION
@@ -193,7 +193,7 @@ def free_motion(actuator: Actuator, motion: Motion, step: float = STEP) -> Motio
     ])  # fmt: skip
     out = np.empty((ticks, 5))
     _move(
-        np.zeros(STATE.end), coefficients, changed, math.ceil(1.0 / (rate * step) - 1e-6), closed,
+        np.zeros(STATE.end), coefficients, changed, math.ceil(1.0 / (rate * STEP) - 1e-6), closed,
         law, commands, noise, lsb, gains, out,
     )  # fmt: skip
     return MotionRecord(out, told)
@@ -305,7 +305,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--hours", type=float, default=10.0, metavar="H", help="between false alarms (%(default)g)")
     add("--changes", action="store_true", help="study changes instead, --cases rounds of all")
-    add("--cause", choices=dict(CHANGES), help="study its change in all kinds of motion instead")
     add("--severities", action="store_true", help="study the stated severities instead")
     add("--calibrate", action="store_true", help="find the monitor's spreads and threshold instead")
     add("--kinds", choices=("known", "held-out"), default="known",
@@ -316,11 +315,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 def _cases(options: Options) -> list[MotionCase]:
     kinds = KINDS if options.kinds == "known" else tuple(HELD_OUT)
-    if options.cause:
-        return [
-            MotionCase(_changed_kind(options.seed, options.cause, number, kinds), options.hours)
-            for number in range(len(kinds) * len(CommandMode))
-        ]
     if options.changes:
         return [
             MotionCase(_changed(options.seed, *item, kinds), options.hours)
@@ -351,20 +345,10 @@ def _changed(seed: int, turn: int, number: int, mode: int, kinds: Sequence[str])
     return changed(motion, *CHANGES[number], CHANGE_S)
 
 
-def _changed_kind(seed: int, cause: str, number: int, kinds: Sequence[str]) -> Motion:
-    """Piece of a kind and a mode with a middling change of a cause."""
-    sizes = [size for name, size in CHANGES if name == cause]
-    place = list(dict(CHANGES)).index(cause)
-    rng = np.random.default_rng((seed, place, number))
-    own = 1000 * seed + 100 * place + number
-    motion = random_motion(rng, number, CHANGED_PIECE_S, own, kinds)
-    return changed(motion, cause, sizes[len(sizes) // 2], CHANGE_S)
-
-
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     if options.calibrate:
         yield from _calibration(records, options.hours)
-    elif options.changes or options.cause:
+    elif options.changes:
         yield from _changes(records)
     elif options.severities:
         yield from _severities(records)
