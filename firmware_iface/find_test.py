@@ -227,8 +227,7 @@ def _observed_command(
     samples: Samples, test: StoredTest, controller: Controller
 ) -> tuple[FloatArray, str]:
     """What was commanded, as far as the recording tells, A or m, and what tells it."""
-    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-    if samples.mode is mode and np.isfinite(samples.command).sum() >= MATCH.commands:
+    if samples.mode is test.command_mode and np.isfinite(samples.command).sum() >= MATCH.commands:
         return samples.command, "command"
     current = np.where(samples.saturated[0], np.nan, samples.current)
     if not test.closed_loop:

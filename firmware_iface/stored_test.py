@@ -16,7 +16,7 @@ import numpy as np
 from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import decode_toml, read_toml
-from firmware_iface.recording import FloatArray
+from firmware_iface.recording import CommandMode, FloatArray
 
 MAX_TEST_DURATION_S = 600.0
 MIN_TEST_TICKS, MAX_TEST_TICKS = 100, 60_000
@@ -136,6 +136,11 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def closed_loop(self) -> bool:
         """Whether the command is a position."""
         return self.mode == "position"
+
+    @property
+    def command_mode(self) -> CommandMode:
+        """What the command is."""
+        return CommandMode.POSITION if self.closed_loop else CommandMode.CURRENT
 
     def time(self) -> FloatArray:
         """Start of each tick, s, shape (ticks,)."""

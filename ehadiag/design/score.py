@@ -106,7 +106,7 @@ def _samples(
     ticks = len(commands)
     return Samples(
         period_ns=round(1e9 / test.rate),
-        mode=CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT,
+        mode=test.command_mode,
         current=np.full(ticks, np.nan),
         spool=answers[:, 0],
         pressure=answers[:, 1],

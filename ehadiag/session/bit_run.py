@@ -40,7 +40,6 @@ from firmware_iface.files import unused_path
 from firmware_iface.recording import (
     BitOutcome,
     BitState,
-    CommandMode,
     Environment,
     Quality,
     Recording,
@@ -164,7 +163,7 @@ class BitView:
         self._monitor, self._by_status = monitor, by_status
         self._traffic = BusTraffic(bitrate)
         self._trace = SignalTrace()
-        self._mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+        self._mode = test.command_mode
         self._transport: Transport | None = None
         self._progress: BitProgress | None = None
         self._working = ""
@@ -510,9 +509,8 @@ def measured_by_xcp(
     from ehadiag_sim.simulation import scales_of  # noqa: PLC0415 - loads numpy
     from firmware_iface.xcp_master import XcpTransport  # noqa: PLC0415 - loads cantools
 
-    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     channels = scales_of(setup.bus_map, setup.actuator).channels
-    return XcpTransport(bus, setup.bus_map, channels, mode, ids, uds=protocol == "uds")
+    return XcpTransport(bus, setup.bus_map, channels, test.command_mode, ids, uds=protocol == "uds")
 
 
 def recording_path(folder: Path, test: StoredTest) -> Path:

@@ -143,11 +143,7 @@ def _in_each_mode(
         return list(_matched_in(cut(None), episode, candidates, margin))
     found: list[Recording] = []
     for mode in modes:
-        own = (
-            CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-            for test in candidates.tests
-        )
-        tests = tuple(test for test, its in zip(candidates.tests, own, strict=True) if its is mode)
+        tests = tuple(test for test in candidates.tests if test.command_mode is mode)
         others = len(tests) < len(candidates.tests)
         part = replace(candidates, tests=tests)
         found += _matched_in(cut(mode), episode, part, margin, others=others)

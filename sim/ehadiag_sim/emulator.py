@@ -17,7 +17,7 @@ from ehadiag_sim.broken_hardware import Hardware, break_hardware
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.control import Conditions, SimulatorControl
 from ehadiag_sim.sensing import ChannelFault
-from ehadiag_sim.simulation import Plant, scales_of
+from ehadiag_sim.simulation import Plant, refuse_other_rate, scales_of
 from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import TickEncoder
@@ -255,7 +255,7 @@ class FccCore:
             test = self._tests[test_id]
             self._commands = test.command().tolist()
             self._elapsed = 0
-            self._mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+            self._mode = test.command_mode
             self._refused = None  # an earlier refusal may still stand on the bus
             self._enter(BitState.ARMING, test_id)
         elif self._state in (BitState.ARMING, BitState.RUNNING):
@@ -354,11 +354,7 @@ def _by_number(tests: Iterable[StoredTest], actuator: Actuator) -> dict[int, Sto
             raise ConfigurationError(
                 f"tests {numbered[test.id].name!r} and {test.name!r} have the same id {test.id}"
             )
-        if test.rate != actuator.controller.rate:
-            raise ConfigurationError(
-                f"test {test.name!r} runs at {test.rate:g} Hz, the controller of actuator "
-                f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
-            )
+        refuse_other_rate(test, actuator)
         numbered[test.id] = test
     return numbered
 

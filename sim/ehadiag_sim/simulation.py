@@ -188,7 +188,7 @@ class SimulatedRun:
         period_ns = round(1e9 / self.test.rate)
         return Samples(
             period_ns=period_ns,
-            mode=_mode(self.test),
+            mode=self.test.command_mode,
             current=decoded[0],
             spool=decoded[1],
             pressure=decoded[2],
@@ -241,11 +241,7 @@ def simulate(
     Arguments are those of `Plant`; the integration step is shortened so that a whole number makes a
     tick. A step out of range, or test and controller at different rates, raise ConfigurationError.
     """
-    if test.rate != actuator.controller.rate:
-        raise ConfigurationError(
-            f"test {test.name!r} runs at {test.rate:g} Hz, the controller of actuator "
-            f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
-        )
+    refuse_other_rate(test, actuator)
     effects = effects or Effects()
     plant = Plant(
         actuator,
@@ -258,7 +254,7 @@ def simulate(
         scales=scales,
         foreign=foreign,
     )
-    command, mode = bus_command(test, plant.scales), _mode(test)
+    command, mode = bus_command(test, plant.scales), test.command_mode
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
     probed = plant.probed
@@ -281,13 +277,22 @@ def simulate(
     )
 
 
+def refuse_other_rate(test: StoredTest, actuator: Actuator) -> None:
+    """Raise ConfigurationError for a test at another rate than the controller's."""
+    if test.rate != actuator.controller.rate:
+        raise ConfigurationError(
+            f"test {test.name!r} runs at {test.rate:g} Hz, the controller of actuator "
+            f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
+        )
+
+
 def bus_command(test: StoredTest, scales: Scales = DEFAULT_SCALES) -> Array:
     """Command of each tick as the control computer holds it, SI (A or m), shape (ticks,).
 
     It has the resolution of the bus signal. The reference recordings show this: their currents
     follow the rounded command, and 2 µm of it are 0.6 LSB of current.
     """
-    step = _resolution(scales, _mode(test))
+    step = _resolution(scales, test.command_mode)
     if step == 0.0:
         return test.command()
     rounded: Array = np.rint(test.command() / step) * step
@@ -303,10 +308,6 @@ def _on_the_bus(supply: float, drain: float, degc: float) -> Environment:
         temperature_std=0.1 / math.sqrt(12.0),
         supply_std=1e4 / math.sqrt(6.0),
     )
-
-
-def _mode(test: StoredTest) -> CommandMode:
-    return CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
 
 
 def _resolution(scales: Scales, mode: CommandMode) -> float:

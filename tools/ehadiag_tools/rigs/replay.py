@@ -255,7 +255,7 @@ def recorded_columns(case: DaqCase) -> dict[str, NDArray[np.float64]]:
     """Columns that the acquisition writes: SI, times in s."""
     test, actuator = bundled_tests()[case.test], default_actuator()
     rng = np.random.default_rng(case.seed)
-    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+    mode = test.command_mode
     rest = round((SETTLING_S + case.lead_in_s) * test.rate)
     after = round(AFTER_S * test.rate)
     command = np.concatenate([np.zeros(rest), bus_command(test), np.zeros(after)])
