@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO, cast
 
-from ehadiag.core.conventions import PIPE_COLUMNS
 from firmware_iface.errors import (
     ConfigurationError,
     EhadiagError,
@@ -135,6 +134,8 @@ def render_for_terminal(draw: Callable[[Console], None], *, least: int = 0) -> s
     Returns the text, with its end of line.
     """
     from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
+
+    from ehadiag.core.conventions import PIPE_COLUMNS  # noqa: PLC0415 - not for help texts
 
     there = Console()
     width = max(there.width, least) if there.is_terminal else PIPE_COLUMNS
