@@ -260,7 +260,6 @@ class Option(msgspec.Struct, frozen=True):
     """A field of `Request`, as command line, files of defaults and errors need it."""
 
     name: str
-    """Of the field."""
     flag: str
     """Of the command line; empty for what is no option."""
     kind: type[Any]

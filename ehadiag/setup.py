@@ -59,7 +59,6 @@ class RecordingOrigin(TypedDict, total=False):
     files: Sequence[str]
     """That they were read from; empty where they were at hand."""
     logs: Sequence[Log | None]
-    """Log of each recording."""
     read_s: float
     """Time of reading or acquiring them, s."""
     ended_at: float | None
@@ -162,7 +161,6 @@ class Setup:
     """What a request names, loaded when it is first used; it can be sent to workers."""
 
     request: Request
-    """What is asked for."""
     objects: Mapping[str, Any] = field(default_factory=dict)
     """Given as objects, not by name, by the fields of the request: `actuator`, `test`, `mapping`,
     `columns`, `solver`, `prior`; and `candidates`, tests to look for."""

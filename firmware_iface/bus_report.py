@@ -57,21 +57,15 @@ class MessageReport(msgspec.Struct, frozen=True):
     """One mapped message."""
 
     name: str
-    """Which."""
     can_id: int
-    """See `name`."""
     extended: bool
-    """See `name`."""
     roles: tuple[str, ...]
     """What it carries for us."""
     received: int
     """Frames."""
     crc_errors: int
-    """See `received`."""
     length_errors: int
-    """See `received`."""
     range_errors: int
-    """See `received`."""
     lost: int | None
     """Frames that the counter says are missing; None without a counter."""
     conflicts: int
@@ -85,7 +79,6 @@ class MessageReport(msgspec.Struct, frozen=True):
     counter: bool
     """Whether the mapping has them."""
     crc: bool
-    """See `counter`."""
 
 
 class RangeUse(msgspec.Struct, frozen=True):
@@ -110,7 +103,6 @@ class BusReport(msgspec.Struct, frozen=True):
     frames: int
     """All frames, error frames."""
     errors: int
-    """See `frames`."""
     messages: tuple[MessageReport, ...]
     """Mapped messages, heard or not."""
     ranges: tuple[RangeUse, ...]

@@ -78,15 +78,12 @@ class Decoded(msgspec.Struct, frozen=True, eq=False):
     """The frames of one message; n of them passed the checks."""
 
     message: MessageMap
-    """What it is."""
     received: IntArray
     """Rows of the table with its identifier, good or bad."""
     crc_bad: IntArray
     """Rows that failed a check."""
     length_bad: IntArray
-    """See `crc_bad`."""
     range_bad: IntArray
-    """See `crc_bad`."""
     row: IntArray
     """Rows that passed length and check sum, shape (n,), ascending."""
     data: NDArray[np.uint8]

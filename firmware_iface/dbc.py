@@ -39,17 +39,13 @@ class SignalLayout(msgspec.Struct, frozen=True):
     big_endian: bool = False
     """Number format; floats have 16, 32 or 64 bits."""
     signed: bool = False
-    """See `big_endian`."""
     is_float: bool = False
-    """See `big_endian`."""
     scale: float = 1.0
     """Physical value = raw * scale + offset."""
     offset: float = 0.0
-    """See `scale`."""
     minimum: float | None = None
     """Physical range, None where the DBC gives none."""
     maximum: float | None = None
-    """See `minimum`."""
     unit: str = ""
     """Unit text of the DBC."""
     selectors: tuple[tuple[SignalLayout, frozenset[int]], ...] = ()

@@ -73,7 +73,6 @@ class MatchedTest(msgspec.Struct, frozen=True):
     """A stored test in a stream of samples."""
 
     test: StoredTest
-    """Which."""
     first: int
     """Row of the samples that is its tick 0; may lie before the first one."""
     command_first: int

@@ -118,7 +118,6 @@ class Scales(msgspec.Struct, frozen=True):
     """How finely, and how far, a flight-control computer sees its actuator and its commands."""
 
     channels: Channels = CHANNELS
-    """Its converters."""
     current_step: float = 0.5e-6
     """Resolution of commanded currents on its bus (BUS-8), A; 0: exact."""
     position_step: float = 2e-6

@@ -212,11 +212,9 @@ class RequestOutcome(msgspec.Struct, frozen=True):
     test_id: int | None
     """Number of the test and of the actuator; None where the bus did not say."""
     serial: int | None
-    """See `test_id`."""
     abort_confirmed: bool | None
     """Whether an abort was obeyed; None when none was requested."""
     frames: int
-    """Frames received."""
     dropped: int
     """Frames that the reader was too slow for; the recording has them."""
     degraded: str

@@ -40,7 +40,6 @@ class CalibratedValue(msgspec.Struct, frozen=True):
     """One thing that was learned of the unit; SI."""
 
     name: str
-    """Of the parameter."""
     symbol: str
     meaning: str
     unit: str
@@ -80,7 +79,6 @@ class Calibrated(msgspec.Struct, frozen=True, eq=False):
     """What was learned from, with the unit's own constants; empty where nothing was."""
     seed: int
     evaluations: int
-    """Runs of the model."""
     elapsed: float
     """s."""
 
@@ -95,7 +93,6 @@ class SearchRules(msgspec.Struct, frozen=True):
     """Budgets of the searches of a calibration, and what leads to another search."""
 
     max_runs: int = 4000
-    """Number of model runs."""
     max_runs_one_start: int = 1
     """Number of model runs of a search that ends after its first start."""
     max_runs_two_starts: int = 800

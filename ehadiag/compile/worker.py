@@ -28,7 +28,6 @@ class TableArgument(msgspec.Struct, frozen=True):
     """Not an argument of the C function: the kernel is given the address of constants."""
 
     name: str
-    """Of the table."""
 
 
 class SlotArguments(msgspec.Struct, frozen=True):
@@ -42,7 +41,6 @@ class CFunction(msgspec.Struct, frozen=True):
     """A C function, `int name(pointer, …)`, and the kernel behind it."""
 
     name: str
-    """Of the C function."""
     kernel: Any
     """Decorated kernel that returns a whole number; it takes addresses, numbers and tuples of
     numbers."""
@@ -80,9 +78,7 @@ class ObjectFile(msgspec.Struct, frozen=True):
     functions: Sequence[CFunction]
     """The C functions in it."""
     processor: Processor
-    """The target."""
     tables: Mapping[str, Sequence[float]] = msgspec.field(default_factory=dict)
-    """Constants by name."""
     replaced: Mapping[str, Any] = msgspec.field(default_factory=dict)
     """Functions of one number of the C library, and the kernels that stand for them."""
     allowed: frozenset[str] = frozenset()

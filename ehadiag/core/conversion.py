@@ -76,7 +76,6 @@ class Conversion(NamedTuple):
     """The converters of a recording."""
 
     channels: Channels
-    """Ranges and steps."""
     saturated: NDArray[np.bool_]
     """Shape (4, ticks): the converter stood at its end."""
 

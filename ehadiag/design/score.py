@@ -125,7 +125,6 @@ class Bound(msgspec.Struct, frozen=True, eq=False):
     """The Cramér-Rao bound at one point, all other unknowns free."""
 
     severities: tuple[float, ...]
-    """The point."""
     std: NDArray[np.float64]
     """Smallest deviation of an unbiased estimate of each severity, shape (k,)."""
     laws: NDArray[np.float64]
@@ -148,7 +147,6 @@ class Score(msgspec.Struct, frozen=True, eq=False):
     """What a test shows, and what it asks of the actuator."""
 
     bounds: tuple[Bound, ...]
-    """At each point."""
     figure: float
     """Geometric mean of the bounds of all severities at all points, if the laws hold."""
     travel: float
@@ -297,7 +295,6 @@ class VariantSpace(msgspec.Struct, frozen=True, eq=False):
     """Variants of a test as points: logarithms of factors, 0 for the test itself."""
 
     test: StoredTest
-    """The test itself."""
     lower: NDArray[np.float64]
     """Bounds of the points, shape (k,)."""
     upper: NDArray[np.float64]

@@ -61,7 +61,6 @@ class FmuVariable(msgspec.Struct, frozen=True):
     """A number that a unit shows to its master."""
 
     name: str
-    """Its name."""
     causality: str
     """"parameter", "input" or "output"."""
     start: float
@@ -216,7 +215,6 @@ class _FmuModel(msgspec.Struct, frozen=True):
     functions: tuple[CFunction, ...]
     """Of the object code."""
     tables: Mapping[str, Sequence[float]]
-    """Its constants."""
     memory: int
     """Numbers that an instance keeps."""
     hooks: str

@@ -113,7 +113,6 @@ class Panel(msgspec.Struct, frozen=True, eq=False):
     """Curves over one vertical axis."""
 
     name: str
-    """Of the signal."""
     unit: str
     x: CurveValues
     curves: tuple[Curve, ...]
@@ -198,7 +197,6 @@ class PictureColumn(msgspec.Struct, frozen=True, eq=False):
     dates: bool = False
     """Whether the abscissae are times of day, s since 1970."""
     source: str = ""
-    """Of the recording."""
 
     @property
     def events(self) -> bool:

@@ -43,7 +43,6 @@ class UnitTrend(msgspec.Struct, frozen=True):
     """The unit's history and prognosis."""
 
     entries: Sequence[Entry]
-    """Diagnoses that count."""
     events: Sequence[MaintenanceEvent]
     prognosis: Prognosis
 

@@ -47,7 +47,6 @@ class Session(NamedTuple):
     """What runs in a process of its own."""
 
     title: str
-    """Name for the page."""
     function: Callable[..., int]
     """Called with the arguments and with what takes snapshots; a module's function. Returns the
     exit code."""

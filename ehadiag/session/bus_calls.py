@@ -558,7 +558,6 @@ class SimulatorRun(msgspec.Struct, frozen=True):
     """What the simulated computer did."""
 
     ticks: int
-    """Number of control ticks."""
     tests_started: int
     """Number of tests that were started."""
 

@@ -31,9 +31,7 @@ class Episode(msgspec.Struct, frozen=True):
     test_id: int | None
     """None if the bus does not say."""
     serial: int | None
-    """See `test_id`."""
     outcome: BitOutcome
-    """How it ended."""
     ended: int | None = None
     """Row of the status frame that told of the end; None without one."""
     notes: tuple[str, ...] = ()

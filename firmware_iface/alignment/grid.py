@@ -77,13 +77,9 @@ class TickGrid(msgspec.Struct, frozen=True, eq=False):
     """One test's tick grid, and the rows of the table that can hold its frames."""
 
     episode: Episode
-    """The test."""
     decoded: DecodedTable
-    """All frames."""
     axis: TickAxis
-    """Their ticks."""
     bus_map: BusMap
-    """What they mean."""
     begin: int
     """First row that can hold one of the test's."""
     end: int

@@ -34,9 +34,7 @@ class StatusTable(msgspec.Struct, frozen=True, eq=False):
     reason: IntArray
     """Numbers, -1 unknown."""
     test_id: IntArray
-    """See `reason`."""
     serial: IntArray
-    """See `reason`."""
     elapsed: FloatArray
     """Ticks, NaN unknown."""
     following: IntArray

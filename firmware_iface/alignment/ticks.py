@@ -236,9 +236,7 @@ class TickAxis(msgspec.Struct, frozen=True, eq=False):
     row: IntArray
     """The frames that define the axis, in order of arrival."""
     tick: IntArray
-    """See `row`."""
     time_ns: IntArray
-    """See `row`."""
     every: Mapping[str, int]
     """Per message, ticks between two frames of one stream."""
     turn: int

@@ -98,7 +98,6 @@ class Deviation(msgspec.Struct, frozen=True):
     residuals: Callable[[float, float], FloatArray]
     """By phase (ticks) and rate of the clock, less their median."""
     name: str
-    """Of what."""
 
 
 def fit_clock(

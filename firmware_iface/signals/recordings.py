@@ -141,7 +141,6 @@ class TickReading(msgspec.Struct, frozen=True):
     """One way to put signals on ticks."""
 
     clock: TickClock
-    """The ticks."""
     held: Mapping[str, FloatArray]
     """Values that a bus held, on them, by role."""
     acquired: Acquisition | None

@@ -126,7 +126,6 @@ class SignalGroup(msgspec.Struct, frozen=True, eq=False):
     """Held signals that change together."""
 
     roles: tuple[str, ...]
-    """Which."""
     at: FloatArray
     """Times of the first samples of new values, s."""
 

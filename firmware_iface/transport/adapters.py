@@ -82,7 +82,6 @@ class BusOptions(msgspec.Struct, frozen=True):
     bitrate: int | None = None
     """bit/s."""
     data_bitrate: int | None = None
-    """See `bitrate`."""
     fd: bool = False
     """Accept CAN FD frames."""
     app_name: str | None = None

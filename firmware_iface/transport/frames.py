@@ -30,7 +30,6 @@ class Frame(msgspec.Struct, frozen=True):
     extended: bool = False
     """29-bit identifier."""
     fd: bool = False
-    """CAN FD frame."""
     error: bool = False
     """Error frame; identifier and payload then carry no message."""
     remote: bool = False
@@ -64,13 +63,9 @@ class FrameTable(msgspec.Struct, frozen=True, eq=False):
     extended: BoolArray
     """Bool, shape (n,)."""
     fd: BoolArray
-    """See `extended`."""
     error: BoolArray
-    """See `extended`."""
     remote: BoolArray
-    """See `extended`."""
     sent: BoolArray
-    """See `extended`."""
     channel: NDArray[np.uint16]
     """uint16, adapter channel of each frame, 0 where it is not said, shape (n,)."""
 

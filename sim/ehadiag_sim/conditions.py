@@ -14,7 +14,6 @@ class ConditionOption(NamedTuple):
     """Command-line option of one field of a condition."""
 
     field: str
-    """Name of the field."""
     flag: str
     """Name of the option, such as `--null-bias-mA`."""
     metavar: str
