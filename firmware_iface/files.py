@@ -94,7 +94,7 @@ def decode_toml(text: bytes, kind: type[T], where: str) -> T:
         _refuse_non_finite(tree, where, "$")
         return msgspec.convert(tree, kind)
     except msgspec.ValidationError as error:
-        raise ConfigurationError(f"{where}: {_one_line(error)}") from None
+        raise ConfigurationError(f"{where}: {' '.join(str(error).split())}") from None
     except (ValueError, RecursionError) as error:  # a number may have too many digits
         raise ConfigurationError(f"{where}: not valid TOML{_error_place(error)}") from None
 
@@ -114,10 +114,6 @@ def _error_place(error: Exception) -> str:
     """Where the parser stumbled, without a word of what stands there: it may be any file."""
     found = TOML_ERROR_PLACE.search(str(error))
     return f" at line {found[1]}, column {found[2]}" if found else ""
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 RESULT_MODE = 0o644

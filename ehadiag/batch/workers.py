@@ -47,12 +47,12 @@ def expand_logs(names: Iterable[str], report: Callable[[str], None]) -> list[Log
     name that stands for no recording is in the list too, with the reason. ConfigurationError: the
     list on standard input is longer than any list of names.
     """
-    return [item for name in names for item in _expand_name(name, report)]
-
-
-def _expand_name(name: str, report: Callable[[str], None]) -> Iterator[LogInput]:
-    for path in _names_on_standard_input() if name == STANDARD_INPUT_NAME else [name]:
-        yield from _expand_path(path, report)
+    return [
+        item
+        for name in names
+        for path in (_names_on_standard_input() if name == STANDARD_INPUT_NAME else [name])
+        for item in _expand_path(path, report)
+    ]
 
 
 def _expand_path(name: str, report: Callable[[str], None]) -> Iterator[LogInput]:

@@ -83,7 +83,8 @@ class CalledOptions:
         for group in parser._mutually_exclusive_groups:
             if action not in group._group_actions:
                 continue
-            if any(self._is_given(other) for other in group._group_actions):
+            flags = [flag for other in group._group_actions for flag in other.option_strings]
+            if any(item.split("=", 1)[0] in flags for item in self._given):
                 return  # the command line has chosen among them
             if checked is not False:  # one of them, as on the command line; the nearer wins
                 for other in group._group_actions:
@@ -91,9 +92,6 @@ class CalledOptions:
                 group.required = False
         parser.set_defaults(**{action.dest: checked})
         action.required = False
-
-    def _is_given(self, action: argparse.Action) -> bool:
-        return any(item.split("=", 1)[0] in action.option_strings for item in self._given)
 
 
 def _verbs(parser: argparse.ArgumentParser) -> Iterator[Mapping[str, argparse.ArgumentParser]]:

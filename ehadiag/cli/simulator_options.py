@@ -85,11 +85,6 @@ def add_simulator_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def scenario_keys() -> tuple[str, ...]:
-    """Return the keys that a scenario file may have."""
-    return (*(item.key for kind in CONDITIONS for item in condition_options(kind)), *OTHER_KEYS)
-
-
 def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the keyword arguments of `ehadiag_sim.emulator.emulated_computer`.
 
@@ -142,7 +137,8 @@ def _control(arguments: argparse.Namespace) -> SimulatorControl | None:
 
 
 def _refuse_unknown_keys(scenario: Mapping[str, Any], where: str) -> None:
-    known = scenario_keys()
+    known = [item.key for kind in CONDITIONS for item in condition_options(kind)]
+    known += OTHER_KEYS
     for name in scenario:
         if name not in known:
             near = closest_name(name, known)

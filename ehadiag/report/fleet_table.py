@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -138,14 +138,13 @@ def _sparkline(values: Sequence[float], levels: Levels) -> str:
     )
     lines = "".join(
         f'<line class="{name}" x1="0" x2="100" y1="{y:.1f}" y2="{y:.1f}"/>'
-        for name, y in _level_heights({"advisory": levels.advisory, "limit": levels.limit}).items()
+        for name, y in (
+            ("advisory", 30.0 * (1.0 - levels.advisory)),
+            ("limit", 30.0 * (1.0 - levels.limit)),
+        )
     )
     return Markup(
         f'<svg class="spark" viewBox="0 0 100 30" width="100" height="30" role="img"'
         f' aria-label="worst severity, {len(shown)} tests">{lines}'
         f'<polyline points="{points}"/></svg>'
     )
-
-
-def _level_heights(levels: Mapping[str, float]) -> dict[str, float]:
-    return {name: 30.0 * (1.0 - level) for name, level in levels.items()}

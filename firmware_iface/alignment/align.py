@@ -74,7 +74,8 @@ def assemble(
     present = channels_in(table, bus_map) if channels is None else channels
     channel, ambiguous = choose_channel(bus_map.channel, present)
     if ambiguous:
-        return (_undecoded(source, notes, ambiguous),)
+        quality = Quality(notes=notes, refused=(ambiguous,))
+        return (Recording(source, None, None, None, BitOutcome(), Environment(), quality),)
     bus_map = replace(bus_map, channel=channel)
     decoded = decode(table, bus_map)
     axis = place_frames(decoded, bus_map.tick_ns)
@@ -184,11 +185,6 @@ def _matched_in(
         cut = rows_of_samples(one.samples, margin, margin, episode.ticks)
         return tuple(replace(item, samples=cut, start_ns=_start_ns(cut)) for item in found)
     return found
-
-
-def _undecoded(source: str, notes: tuple[str, ...], why: str) -> Recording:
-    quality = Quality(notes=notes, refused=(why,))
-    return Recording(source, None, None, None, BitOutcome(), Environment(), quality)
 
 
 def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
@@ -372,14 +368,12 @@ def windowed_recordings(
             if recording.samples is not None or recording.test_id is not None:
                 found = True
                 yield recording
-            elif empty is None or _is_more_informative(recording, empty):
+            elif (
+                empty is None or empty.outcome.state is None or recording.outcome.state is not None
+            ):
                 empty = recording
     if not found and empty is not None:
         yield empty
-
-
-def _is_more_informative(new: Recording, old: Recording) -> bool:
-    return new.outcome.state is not None or old.outcome.state is None
 
 
 def _windows(

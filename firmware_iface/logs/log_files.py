@@ -298,11 +298,6 @@ def known_suffixes() -> tuple[str, ...]:
     return tuple(dict.fromkeys((*FRAME_READERS, *SIGNAL_READERS, *foreign)))
 
 
-def _own_readers(suffix: str) -> list[FoundReader]:
-    values = (table.get(suffix) for table in (FRAME_READERS, SIGNAL_READERS))
-    return [FoundReader(pkgutil.resolve_name(value)(), "") for value in values if value]
-
-
 def _plugin_readers(suffix: str, own: list[FoundReader]) -> list[FoundReader]:
     """Readers of other packages for a suffix; one for the files of another reader is refused."""
     found: list[FoundReader] = []
@@ -342,7 +337,8 @@ def _clash(new: FoundReader, other: FoundReader) -> bool:
 def _candidates(path: Path) -> list[FoundReader]:
     """The one reader whose signature a log has, or else all without one, or else the package's."""
     suffix = kind_of(path)
-    own = _own_readers(suffix)
+    values = (table.get(suffix) for table in (FRAME_READERS, SIGNAL_READERS))
+    own = [FoundReader(pkgutil.resolve_name(value)(), "") for value in values if value]
     try:
         begin = text_beginning(path)
     except OSError:

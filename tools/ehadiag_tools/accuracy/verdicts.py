@@ -185,7 +185,12 @@ def alarm_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     rows = []
     for label, sound in (("sound, not HEALTHY", True), ("worn, HEALTHY", False)):
         each = [
-            [_is_wrong(item) for item in tested if _is_sound(item) is sound] for tested in units
+            [
+                (item["verdict"] == Verdict.HEALTHY.name) is not sound
+                for item in tested
+                if _is_sound(item) is sound
+            ]
+            for tested in units
         ]
         count, wrong, any_wrong = sum(map(len, each)), sum(map(sum, each)), sum(map(any, each))
         low, high = _clopper_pearson(any_wrong, len(each))
@@ -203,10 +208,6 @@ def alarm_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
 
 def _is_sound(item: Record) -> bool:
     return bool(max(item["faults"]) <= SOUND)
-
-
-def _is_wrong(item: Record) -> bool:
-    return bool((item["verdict"] == Verdict.HEALTHY.name) is not _is_sound(item))
 
 
 def _clopper_pearson(events: int, count: int) -> tuple[float, float]:
