@@ -82,12 +82,6 @@ def _value(name: str, dop: str, at: int | None, semantic: str = "DATA") -> Node:
     return _param("VALUE", name, _node("DOP-REF", ID_REF=dop), at=at, semantic=semantic)
 
 
-def _echo(name: str, at: int, size: int = 1, request_at: int = 0) -> Node:
-    place = _node("REQUEST-BYTE-POS", str(request_at))
-    length = _node("BYTE-LENGTH", str(size))
-    return _param("MATCHING-REQUEST-PARAM", name, place, length, at=at)
-
-
 def _identity() -> Node:
     return _node("COMPU-METHOD", _node("CATEGORY", "IDENTICAL"))
 
@@ -289,9 +283,10 @@ def _dictionary(records: Sequence[DataRecord]) -> Node:
 def _layer(identifiers: UdsIdentifiers) -> Node:
     """Make protocol, base variant with all services, and the computer as its only variant."""
     services = _services()
+    echo = _node("REQUEST-BYTE-POS", "0"), _node("BYTE-LENGTH", "1")
     negative = [
         _constant("SID", NEGATIVE_RESPONSE, 1, 0, "SERVICE-ID"),
-        _echo("RequestSID", 1),
+        _param("MATCHING-REQUEST-PARAM", "RequestSID", *echo, at=1),
         _value("ResponseCode", "Dop.ResponseCode", 2),
     ]
     table = _node(

@@ -173,11 +173,8 @@ class _ProgressLines:
 
 
 @contextmanager
-def progress_bar(*, shown: bool = True) -> Iterator[Callable[[str, float], None]]:
-    """Show stage, share done and time left on standard error, in a log as lines, if `shown`."""
-    if not shown:
-        yield lambda _stage, _share: None
-        return
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """Show stage, share done and time left on standard error, in a log as lines."""
     if not sys.stderr.isatty():
         yield _ProgressLines().update
         return

@@ -244,7 +244,7 @@ def configures_a_bus() -> bool:
 
     Returns of the default context. ConfigurationError: they cannot be read.
     """
-    return "interface" in _merged_options(None)
+    return "interface" in {**_file_options(None), **_environment_options(None)}
 
 
 def with_configuration(options: BusOptions, context: str | None) -> BusOptions:
@@ -289,15 +289,6 @@ def _typed_options(own: Mapping[str, Any]) -> dict[str, Any]:
     if out.get("channel") is not None:
         out["channel"] = str(out["channel"])
     return out
-
-
-def _merged_options(context: str | None) -> dict[str, Any]:
-    return {
-        **_file_options(None),
-        **_file_options(context),
-        **_environment_options(None),
-        **_environment_options(context),
-    }
 
 
 def _file_options(context: str | None) -> dict[str, str]:

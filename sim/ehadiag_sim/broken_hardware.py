@@ -62,8 +62,6 @@ def simulate_broken(
     actuator: Actuator,
     test: StoredTest,
     faults: Faults | None = None,
-    effects: Effects | None = None,
-    sensors: Sensors | None = None,
     *,
     step: float = DEFAULT_STEP_S,
 ) -> Recording:
@@ -72,7 +70,7 @@ def simulate_broken(
     rng: sizes of the damage and seed of the noise; step: longest integration step, s. An unknown
     kind or a value out of range raises ConfigurationError.
     """
-    whole = Hardware(actuator, effects or Effects(), sensors or Sensors())
+    whole = Hardware(actuator, Effects(), Sensors())
     item = break_hardware(kind, rng, whole)
     done = simulate(
         item.actuator,
