@@ -19,7 +19,8 @@ from ehadiag import ConfigurationError, Levels
 from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, Usage
 from ehadiag.history.store import History
-from ehadiag.prognosis.forecast import RemainingLife, forecast, learn_fleet
+from ehadiag.prognosis.averaging import learn_fleet
+from ehadiag.prognosis.forecast import RemainingLife, forecast
 from ehadiag.prognosis.lives import Life
 from ehadiag.prognosis.units import Prognosis
 from ehadiag.report.fleet_table import FleetUnit, fleet_table
