@@ -23,6 +23,7 @@ from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.history.records import DIAGNOSIS_TABLE, EVENT_TABLE
+from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.report.head import shown_date
 from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
 from firmware_iface.errors import (
@@ -39,10 +40,8 @@ if TYPE_CHECKING:
 
 WITHDRAWABLE_KINDS = (DIAGNOSIS_TABLE, EVENT_TABLE)
 REPLACED_PARTS = {
-    "filter": ("Kintas",),
-    "valve": ("Kintas", "FSS"),
-    "jack": ("FDJ",),
-    "unit": ("Kintas", "FSS", "FDJ"),
+    part: tuple(name for name, law in FAULT_LAWS.items() if part in (*law.parts, "unit"))
+    for part in (*dict.fromkeys(part for law in FAULT_LAWS.values() for part in law.parts), "unit")
 }
 """Severities that begin anew where a part is replaced; the first stage's filter is in the valve."""
 HISTORY_COLUMNS = (
@@ -113,7 +112,8 @@ def define_history(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="severity that begins anew (Kintas, FSS, FDJ); repeatable (default: those that fall)",
+        help=f"severity that begins anew ({', '.join(FAULT_LAWS)}); repeatable (default: those"
+        " that fall)",
     )
     event.add_argument(
         "--replaced",
@@ -226,7 +226,6 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _import(arguments: argparse.Namespace) -> None:
     from ehadiag.history.tables import entries_from_csv  # noqa: PLC0415
-    from ehadiag.model.registry import FAULT_NAMES  # noqa: PLC0415 - loads numpy
 
     # A million rows.
     content = read_small_file(Path(arguments.file), 200_000_000, "table")
@@ -234,7 +233,7 @@ def _import(arguments: argparse.Namespace) -> None:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigurationError(f"{arguments.file}: is not UTF-8") from None
-    entries = entries_from_csv(text, arguments.file, FAULT_NAMES)
+    entries = entries_from_csv(text, arguments.file, tuple(FAULT_LAWS))
     with open_named_history(arguments) as history:
         number = history.append_new(entries)
     there = len(entries) - number
@@ -268,11 +267,10 @@ def _event(arguments: argparse.Namespace) -> None:
         MaintenanceEvent,
         current_utc_text,
     )
-    from ehadiag.model.registry import FAULT_NAMES  # noqa: PLC0415 - loads numpy
 
-    strangers = [name for name in arguments.resets if name not in FAULT_NAMES]
+    strangers = [name for name in arguments.resets if name not in FAULT_LAWS]
     if strangers:
-        raise ConfigurationError(f"--resets {strangers[0]}: there is {', '.join(FAULT_NAMES)}")
+        raise ConfigurationError(f"--resets {strangers[0]}: there is {', '.join(FAULT_LAWS)}")
     if not arguments.text.strip():
         raise ConfigurationError("TEXT: is empty; say what was done")
     when, now = arguments.when and _when(arguments.when), current_utc_text()
@@ -286,7 +284,7 @@ def _event(arguments: argparse.Namespace) -> None:
         actuator=arguments.actuator,
         usage=usage_from_options(arguments),
         text=valid_text(arguments.text),
-        resets=tuple(name for name in FAULT_NAMES if name in renewed.union(arguments.resets)),
+        resets=tuple(name for name in FAULT_LAWS if name in renewed.union(arguments.resets)),
     )
     with open_named_history(arguments) as history:
         event = replace(event, actuator=history.actuator_of(event.serial, event.actuator))
