@@ -29,7 +29,7 @@ from ehadiag.batch.result_files import (
     result_row,
 )
 from ehadiag.estimate import Effect
-from ehadiag.export.fmu import monitor_variables
+from ehadiag.export.fmu import actuator_variables, monitor_variables
 from ehadiag.history.records import Usage, history_entry
 from ehadiag.history.store import History
 from ehadiag.identify.identification_result import Nuisance
@@ -267,6 +267,7 @@ def test_every_effect_that_is_freed_has_a_limit_and_is_simulated(item: Parameter
     actuator = msgspec.structs.replace(actuator, second_stage=stage)
     name = item.condition or item.name
     assert name in {option.field for option in condition_options(Effects)}
+    assert (name, item.unit) in {(shown.name, shown.unit) for shown in actuator_variables()}
     changed = Effects(**{name: 0.3 * item.scale})
     plants = (
         Plant(actuator, Faults(), effects, Sensors(noise_lsb=0.0))
