@@ -79,6 +79,7 @@ FMU_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "A": {"A": 1},
     "m": {"m": 1},
     "m/s": {"m": 1, "s": -1},
+    "m³": {"m": 3},
     "s": {"s": 1},
     "N": {"kg": 1, "m": 1, "s": -2},
     "N/m": {"kg": 1, "s": -2},

@@ -28,8 +28,9 @@ from ehadiag.batch.result_files import (
     result_columns,
     result_row,
 )
+from ehadiag.core.actuator import Actuator
 from ehadiag.estimate import Effect
-from ehadiag.export.fmu import actuator_variables, monitor_variables
+from ehadiag.export.fmu import FMU_UNITS, actuator_variables, monitor_variables
 from ehadiag.history.records import Usage, history_entry
 from ehadiag.history.store import History
 from ehadiag.identify.identification_result import Nuisance
@@ -243,6 +244,18 @@ def test_every_parameter_reaches_every_output(everything: Result, tmp_path: Path
     assert set(known.effects) == effects - {item.name for item in SENSOR_OFFSETS}
 
 
+def assert_same_laws(values: dict[str, float], effects: Effects, actuator: Actuator) -> None:
+    """Of simulator and model: what both name has the same size with these values."""
+    free = Unknowns(tuple(map(parameter, values)), (plant_constants(actuator),), {})
+    constants = free.constants(np.array(list(values.values())))._asdict()
+    faults = Faults(**{name: value for name, value in values.items() if name in FAULT_LAWS})
+    coefficients = plant_coefficients(actuator, faults, effects)._asdict()
+    both = constants.keys() & coefficients.keys()
+    assert {name: constants[name] for name in both} == pytest.approx(
+        {name: coefficients[name] for name in both}
+    )
+
+
 def test_every_severity_reaches_simulator_monitor_and_exports() -> None:
     names = tuple(item.name for item in FAULTS)
     assert tuple(field.name for field in fields(Faults)) == names
@@ -255,20 +268,27 @@ def test_every_severity_reaches_simulator_monitor_and_exports() -> None:
         plant_coefficients(default_actuator(), faults, Effects()) for faults in (Faults(), worn)
     )
     assert sum(a != b for a, b in zip(new, damaged, strict=True)) >= len(names)
+    assert_same_laws(dict.fromkeys(names, 0.5), Effects(), default_actuator())
     windows = bundled_tests()["open"].windows.__struct_fields__
     assert all(law.windows in windows for law in FAULT_LAWS.values())
 
 
-@pytest.mark.parametrize("item", [item for item in EFFECTS if item.basic], ids=lambda x: x.name)
+FREED = [item for item in EFFECTS if item.basic or item.limit]
+
+
+@pytest.mark.parametrize("item", FREED, ids=lambda item: item.name)
 def test_every_effect_that_is_freed_has_a_limit_and_is_simulated(item: Parameter) -> None:
     actuator = default_actuator()
+    assert item.basic
     assert item.limit_of(actuator) is not None
     stage = msgspec.structs.replace(actuator.second_stage, kind="orifice")
     actuator = msgspec.structs.replace(actuator, second_stage=stage)
     name = item.condition or item.name
     assert name in {option.field for option in condition_options(Effects)}
     assert (name, item.unit) in {(shown.name, shown.unit) for shown in actuator_variables()}
+    assert item.unit in FMU_UNITS
     changed = Effects(**{name: 0.3 * item.scale})
+    assert_same_laws({item.name: 0.3 * item.scale}, changed, actuator)
     plants = (
         Plant(actuator, Faults(), effects, Sensors(noise_lsb=0.0))
         for effects in (Effects(), changed)
