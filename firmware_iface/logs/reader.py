@@ -108,10 +108,10 @@ class FrameLog:
                 return str(error)
             except EhadiagError:
                 raise
-            except Exception:
+            except Exception as error:
                 if not self._origin:
                     raise
-                return "the log breaks off or is damaged"
+                return f"the log breaks off or is damaged: {type(error).__name__} in its reader"
             if table is None:
                 return ""
             if not isinstance(table, FrameTable):
