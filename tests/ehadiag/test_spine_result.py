@@ -252,7 +252,7 @@ def assert_same_laws(values: dict[str, float], effects: Effects, actuator: Actua
     coefficients = plant_coefficients(actuator, faults, effects)._asdict()
     both = constants.keys() & coefficients.keys()
     assert {name: constants[name] for name in both} == pytest.approx(
-        {name: coefficients[name] for name in both}
+        {name: coefficients[name] for name in both}, rel=1e-9, abs=0.0
     )
 
 
