@@ -26,8 +26,7 @@ from firmware_iface.errors import ConfigurationError, InputOutputError, reason_o
 from firmware_iface.files import RESULT_MODE, Folder, create_file, private_folder, reopen_file
 
 if TYPE_CHECKING:
-    from ehadiag.api import PathLike
-    from ehadiag.setup import Progress
+    from ehadiag.setup import PathLike, Progress
     from firmware_iface.recording import Recording
 
 
