@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.core.conventions import utc_text
@@ -27,7 +26,6 @@ from firmware_iface.errors import ConfigurationError, valid_text
 
 if TYPE_CHECKING:
     from ehadiag.result import Result
-    from firmware_iface.recording import Recording
 
 __all__ = [
     "DIAGNOSIS_TABLE",
@@ -42,7 +40,6 @@ __all__ = [
     "entry_object",
     "event_object",
     "hash_of_file",
-    "hash_of_samples",
     "history_entry",
     "is_swap",
     "of_unit",
@@ -350,30 +347,6 @@ def hash_of_file(path: str) -> str | None:
             return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError:
             return None
-
-
-def hash_of_samples(recording: Recording) -> str | None:
-    """Return the SHA-256 of the decoded samples: the same for a log, its packed copy or conversion.
-
-    Hexadecimal; None without samples. Times of arrival do not count: formats round them.
-    """
-    samples = recording.samples
-    if samples is None:
-        return None
-    out = hashlib.sha256(
-        f"{recording.test_id} {recording.serial} {samples.period_ns} {samples.mode}".encode()
-    )
-    for values in (
-        samples.command,
-        samples.current,
-        samples.spool,
-        samples.pressure,
-        samples.position,
-    ):
-        # One zero, one NaN: equal numbers have equal bits.
-        plain = np.where(np.isnan(values), np.nan, values + 0.0)
-        out.update(plain.astype("<f8").tobytes())
-    return out.hexdigest()
 
 
 def current_utc_text() -> str:
