@@ -7,6 +7,7 @@ import csv
 import json
 import math
 import pickle
+import re
 from dataclasses import fields
 from importlib import resources
 from pathlib import Path
@@ -221,7 +222,8 @@ def test_every_parameter_reaches_every_output(everything: Result, tmp_path: Path
             take(everything)
         content = files[suffix].read_bytes()
         for name in (*severities, *effects):
-            assert name.encode() in content, f"{name} is missing in {suffix}"
+            whole = rb"(?<![A-Za-z_])" + name.encode() + rb"(?![A-Za-z_])"
+            assert re.search(whole, content), f"{name} is missing in {suffix}"
         assert is_result_table(files[suffix]) == (suffix in TABLE_FORMATS)
     (row,) = csv.DictReader(files[".csv"].read_text(encoding="utf-8").splitlines())
     parquet = pytest.importorskip("pyarrow.parquet").read_table(files[".parquet"]).to_pylist()[0]
