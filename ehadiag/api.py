@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
 
 import msgspec
 
-from ehadiag.core.actuator import Actuator, actuator_toml, default_actuator, load_actuator
+from ehadiag.core.actuator import Actuator, actuator_toml
 from ehadiag.request import Request
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import write_file
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.recording import Recording
-from firmware_iface.stored_test import StoredTest, bundled_tests, resolve_test
+from firmware_iface.stored_test import StoredTest
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -32,49 +32,22 @@ if TYPE_CHECKING:
     from ehadiag.calibration.unit_models import Calibrated
     from ehadiag.identify.solvers import Solver
     from ehadiag.result import Log, Result
-    from ehadiag.setup import Setup
+    from ehadiag.setup import PathLike, Setup
     from ehadiag_sim.conditions import Effects, Faults, Sensors
     from firmware_iface.bus_map import BusMap
     from firmware_iface.signals.columns import ColumnMap
 
 
-def compile_kernels(
-    notify: Callable[[str], None], *, simulation: bool = False, identification: bool = True
-) -> None:
-    """Compile the kernels that are needed and not there, several at a time.
-
-    notify: is given lines for who waits; none where nothing is compiled.
-    """
-    from ehadiag.compile import libraries  # noqa: PLC0415 - not for help texts
-    from ehadiag.compile.sources import cache_folder  # noqa: PLC0415
-
-    needed = libraries.SIMULATION * simulation + libraries.IDENTIFICATION * identification
-    absent = libraries.missing(needed)
-    if absent:
-        kept = cache_folder() is not None
-        often = "once for this installation" if kept else "in memory, at each start"
-        notify(f"compiling the model's kernels ({', '.join(absent)}), {often}: up to a minute")
-        libraries.prepare(absent, notify)
-
-
 def log_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:
     """Compile what is needed; warnings go to standard error where logging is not set up."""
+    from ehadiag.compile.libraries import compile_kernels  # noqa: PLC0415 - slow
+
     logger = logging.getLogger("ehadiag")
     compile_kernels(
         lambda text: logger.warning("ehadiag: %s", text),
         simulation=simulation,
         identification=identification,
     )
-
-
-PathLike: TypeAlias = str | os.PathLike[str]
-
-
-def resolve_actuator(given: Actuator | PathLike | None) -> Actuator:
-    """Return the actuator itself, or that of a file (`load_actuator`); None: the reference."""
-    if given is None:
-        return default_actuator()
-    return given if isinstance(given, Actuator) else load_actuator(os.fspath(given))
 
 
 def checked_seed(given: int) -> int:
@@ -88,40 +61,7 @@ def checked_seed(given: int) -> int:
     return seed
 
 
-def resolve_stored_test(given: StoredTest | PathLike) -> StoredTest:
-    """Return the test itself, the stored one of that name, or that of a file (`resolve_test`)."""
-    return given if isinstance(given, StoredTest) else resolve_test(os.fspath(given))
-
-
-def stored_tests_with(given: Iterable[StoredTest | PathLike]) -> tuple[StoredTest, ...]:
-    """Return the stored tests and the given ones; of one number the one given last."""
-    tests = {test.id: test for test in bundled_tests().values()}
-    for item in given:
-        test = resolve_stored_test(item)
-        tests[test.id] = test
-    return tuple(tests.values())
-
-
-def resolve_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusMap:
-    """Return the meaning of the bus's frames (`load_map`); None: of the computer's own bus.
-
-    mapping: the meaning itself, or a mapping file; dbc: DBC to use instead of the mapping file's
-    own; without a mapping file, one with the default names. ConfigurationError: a DBC beside a
-    meaning, or one of other names without a mapping file.
-    """
-    from firmware_iface.bus_map import default_map, load_map  # noqa: PLC0415
-
-    other = None if dbc is None else os.fspath(dbc)
-    if isinstance(mapping, str | os.PathLike):
-        return load_map(os.fspath(mapping), other)
-    if mapping is None:
-        return default_map(other)
-    if other is not None:
-        raise ConfigurationError("dbc: the meaning of the frames is given already")
-    return mapping
-
-
-RecordingSource: TypeAlias = Recording | PathLike
+RecordingSource: TypeAlias = "Recording | PathLike"
 """A recording, or the log that it is read from."""
 
 
@@ -214,6 +154,7 @@ def simulate(
     ConfigurationError
         A value out of its range; test and controller at different rates.
     """
+    from ehadiag.setup import resolve_actuator, resolve_stored_test  # noqa: PLC0415
     from ehadiag_sim.conditions import Effects, Faults, Sensors  # noqa: PLC0415 - slow
     from ehadiag_sim.simulation import simulate as run  # noqa: PLC0415
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -285,8 +286,6 @@ def _quality(diagnosis: Diagnosis) -> Quality:
 
 
 def _origin(item: Recording, test: StoredTest | None, log: Log | None) -> Origin:
-    from ehadiag.history.records import hash_of_samples  # noqa: PLC0415 - only with samples
-
     around = item.environment
     named = None
     if test is not None:
@@ -305,6 +304,32 @@ def _origin(item: Recording, test: StoredTest | None, log: Log | None) -> Origin
         onboard=_onboard(item.onboard),
         samples_sha256=hash_of_samples(item),
     )
+
+
+def hash_of_samples(recording: Recording) -> str | None:
+    """Return the SHA-256 of the decoded samples: the same for a log, its packed copy or conversion.
+
+    Hexadecimal; None without samples. Times of arrival do not count: formats round them.
+    """
+    import numpy as np  # noqa: PLC0415 - only with samples
+
+    samples = recording.samples
+    if samples is None:
+        return None
+    out = hashlib.sha256(
+        f"{recording.test_id} {recording.serial} {samples.period_ns} {samples.mode}".encode()
+    )
+    for values in (
+        samples.command,
+        samples.current,
+        samples.spool,
+        samples.pressure,
+        samples.position,
+    ):
+        # One zero, one NaN: equal numbers have equal bits.
+        plain = np.where(np.isnan(values), np.nan, values + 0.0)
+        out.update(plain.astype("<f8").tobytes())
+    return out.hexdigest()
 
 
 def _mega(value: float | None) -> float | None:

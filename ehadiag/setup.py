@@ -5,25 +5,18 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, TypeVar, Unpack
 
 import msgspec
 from msgspec.structs import replace
 
-from ehadiag.api import (
-    PathLike,
-    resolve_actuator,
-    resolve_bus_map,
-    resolve_stored_test,
-    stored_tests_with,
-)
 from ehadiag.assess.verdict import Verdict
-from ehadiag.core.actuator import Actuator, with_tolerance
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator, with_tolerance
 from ehadiag.core.conventions import date_text, fingerprint
 from ehadiag.core.interruption import COMPUTING_THREAD_NAME
 from ehadiag.estimate import Severity
@@ -33,7 +26,7 @@ from ehadiag.result import Log, Mapped, Origin, Result, Sources, load_result
 from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, EhadiagError, NotTestedError, valid_text
 from firmware_iface.find_test import CandidateTests
-from firmware_iface.stored_test import StoredTest
+from firmware_iface.stored_test import StoredTest, bundled_tests, resolve_test
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis, DiagnosisSession
@@ -51,6 +44,63 @@ MAX_OVERTIME_S = 0.5
 """Seconds after its time in which a computation may end by itself, at its next report."""
 
 T = TypeVar("T")
+
+
+PathLike: TypeAlias = str | os.PathLike[str]
+
+
+def resolve_actuator(given: Actuator | PathLike | None) -> Actuator:
+    """Return the actuator itself, or that of a file (`load_actuator`); None: the reference."""
+    if given is None:
+        return default_actuator()
+    return given if isinstance(given, Actuator) else load_actuator(os.fspath(given))
+
+
+def resolve_stored_test(given: StoredTest | PathLike) -> StoredTest:
+    """Return the test itself, the stored one of that name, or that of a file (`resolve_test`)."""
+    return given if isinstance(given, StoredTest) else resolve_test(os.fspath(given))
+
+
+def stored_tests_with(given: Iterable[StoredTest | PathLike]) -> tuple[StoredTest, ...]:
+    """Return the stored tests and the given ones; of one number the one given last."""
+    tests = {test.id: test for test in bundled_tests().values()}
+    for item in given:
+        test = resolve_stored_test(item)
+        tests[test.id] = test
+    return tuple(tests.values())
+
+
+def resolve_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusMap:
+    """Return the meaning of the bus's frames (`load_map`); None: of the computer's own bus.
+
+    Parameters
+    ----------
+    mapping : BusMap | PathLike | None
+        The meaning itself, or a mapping file.
+    dbc : PathLike | None
+        DBC to use instead of the mapping file's own; without a mapping file, one with the default
+        names.
+
+    Returns
+    -------
+    BusMap
+        What each signal is.
+
+    Raises
+    ------
+    ConfigurationError
+        A DBC beside a meaning, or one of other names without a mapping file.
+    """
+    from firmware_iface.bus_map import default_map, load_map  # noqa: PLC0415
+
+    other = None if dbc is None else os.fspath(dbc)
+    if isinstance(mapping, str | os.PathLike):
+        return load_map(os.fspath(mapping), other)
+    if mapping is None:
+        return default_map(other)
+    if other is not None:
+        raise ConfigurationError("dbc: the meaning of the frames is given already")
+    return mapping
 
 
 class RecordingOrigin(TypedDict, total=False):

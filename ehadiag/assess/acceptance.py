@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.lost_samples import objection_to_lost_positions
 from ehadiag.assess.plausibility import objections_to_readings
 from ehadiag.core.actuator import WEAR_EXCESS_FACTOR, Actuator, Calibration
 from ehadiag.core.conversion import conversion_of
-from ehadiag.core.criteria import FIT, READINGS, RECORDING
+from ehadiag.core.criteria import FIT, LOSSES, READINGS, RECORDING
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.identification_result import Fit, Identification
 from ehadiag.identify.prior import has_further_effects
@@ -362,3 +361,28 @@ def notes_on_recording(
 
 def _plain_words(name: str) -> str:
     return name.lower().replace("_", " ")
+
+
+def objection_to_lost_positions(experiment: Experiment) -> str:
+    """Reason why a test's current cannot be rebuilt; empty if it can."""
+    guessed = experiment.trace.guessed
+    if guessed <= LOSSES.max_guessed_share:
+        return ""
+    return (
+        f"{guessed:.1%} of the jack positions that the control law worked on are lost "
+        f"(limit {LOSSES.max_guessed_share:.1%}) and not told by the response: the servovalve "
+        f"current cannot "
+        "be rebuilt"
+    )
+
+
+def objection_to_frame_order(recording: Recording) -> str:
+    """Reason why the ticks of a recording's samples are uncertain; empty if they are not."""
+    share = recording.out_of_order
+    if not recording.by_time or share <= LOSSES.max_out_of_order_share:
+        return ""
+    return (
+        f"by their time stamps {share:.0%} of the commands are of other ticks (limit "
+        f"{LOSSES.max_out_of_order_share:.0%}): the frames have lost their order, and no counter "
+        "tells it"
+    )

@@ -13,6 +13,8 @@ from ehadiag.assess.acceptance import (
     is_explained_by_discrepancy_alone,
     notes_on_recording,
     objection_to_current,
+    objection_to_frame_order,
+    objection_to_lost_positions,
     objections_to_conditions,
     objections_to_duplicates,
     objections_to_estimate,
@@ -24,8 +26,6 @@ from ehadiag.assess.blocks import creep_note, unexplained_block
 from ehadiag.assess.lost_samples import (
     has_observable_severity,
     is_reconstructible,
-    objection_to_frame_order,
-    objection_to_lost_positions,
     reconstruct_lost_samples,
     restrict_to_observable,
     widen_intervals,

@@ -35,31 +35,6 @@ from ehadiag.model.severities import FAULT_LAWS
 from firmware_iface.recording import Recording, Samples
 
 
-def objection_to_lost_positions(experiment: Experiment) -> str:
-    """Reason why a test's current cannot be rebuilt; empty if it can."""
-    guessed = experiment.trace.guessed
-    if guessed <= LOSSES.max_guessed_share:
-        return ""
-    return (
-        f"{guessed:.1%} of the jack positions that the control law worked on are lost "
-        f"(limit {LOSSES.max_guessed_share:.1%}) and not told by the response: the servovalve "
-        f"current cannot "
-        "be rebuilt"
-    )
-
-
-def objection_to_frame_order(recording: Recording) -> str:
-    """Reason why the ticks of a recording's samples are uncertain; empty if they are not."""
-    share = recording.out_of_order
-    if not recording.by_time or share <= LOSSES.max_out_of_order_share:
-        return ""
-    return (
-        f"by their time stamps {share:.0%} of the commands are of other ticks (limit "
-        f"{LOSSES.max_out_of_order_share:.0%}): the frames have lost their order, and no counter "
-        "tells it"
-    )
-
-
 def has_observable_severity(experiments: Sequence[Experiment]) -> bool:
     """Whether so few positions are lost that some severity can be observed."""
     return all(item.trace.guessed <= LOSSES.max_guessed_share_observable for item in experiments)

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from ehadiag.api import compile_kernels
 from ehadiag.batch.journal import ResultJournal
 from ehadiag.batch.result_files import (
     JUNIT_NOT_TESTED,
@@ -41,6 +40,7 @@ from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     INPUT_OUTPUT_EXIT_CODE,
     counting_bar,
+    print_compiling_notice,
     print_status,
     progress_bar,
     worst_exit_code,
@@ -279,7 +279,7 @@ class BatchRun:
     def _among(self, jobs: int) -> int:
         """Diagnose in workers; return how many there were."""
         interrupt_on_signals()
-        compile_kernels(print_status)  # before several workers would
+        print_compiling_notice()  # before several workers would
         new = [task for task in self._inputs if not (task.item.why or self._known(task))]
         with (
             Workers(jobs, self._arguments.cluster) as workers,

@@ -36,6 +36,7 @@ from ehadiag.history.records import (
     of_unit,
     user_history_path,
 )
+from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.report.head import shown_date
 from ehadiag.report.rendering import isolated_png
 from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
@@ -50,10 +51,8 @@ from firmware_iface.files import read_small_file, write_file
 
 WITHDRAWABLE_KINDS = (DIAGNOSIS_TABLE, EVENT_TABLE)
 REPLACED_PARTS = {
-    "filter": ("Kintas",),
-    "valve": ("Kintas", "FSS"),
-    "jack": ("FDJ",),
-    "unit": ("Kintas", "FSS", "FDJ"),
+    part: tuple(name for name, law in FAULT_LAWS.items() if part in (*law.parts, "unit"))
+    for part in (*dict.fromkeys(part for law in FAULT_LAWS.values() for part in law.parts), "unit")
 }
 """Severities that begin anew where a part is replaced; the first stage's filter is in the valve."""
 HISTORY_COLUMNS = (
@@ -124,7 +123,8 @@ def define_history(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="severity that begins anew (Kintas, FSS, FDJ); repeatable (default: those that fall)",
+        help=f"severity that begins anew ({', '.join(FAULT_LAWS)}); repeatable (default: those"
+        " that fall)",
     )
     event.add_argument(
         "--replaced",
@@ -230,7 +230,6 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _import(arguments: argparse.Namespace) -> None:
     from ehadiag.history.tables import entries_from_csv  # noqa: PLC0415
-    from ehadiag.model.registry import FAULT_NAMES  # noqa: PLC0415 - loads numpy
 
     # A million rows.
     content = read_small_file(Path(arguments.file), 200_000_000, "table")
@@ -238,7 +237,7 @@ def _import(arguments: argparse.Namespace) -> None:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigurationError(f"{arguments.file}: is not UTF-8") from None
-    entries = entries_from_csv(text, arguments.file, FAULT_NAMES)
+    entries = entries_from_csv(text, arguments.file, tuple(FAULT_LAWS))
     with open_named_history(arguments) as history:
         number = history.append_new(entries)
     there = len(entries) - number
@@ -266,11 +265,10 @@ def _plot(arguments: argparse.Namespace) -> None:
 
 
 def _event(arguments: argparse.Namespace) -> None:
-    from ehadiag.model.registry import FAULT_NAMES  # noqa: PLC0415 - loads numpy
 
-    strangers = [name for name in arguments.resets if name not in FAULT_NAMES]
+    strangers = [name for name in arguments.resets if name not in FAULT_LAWS]
     if strangers:
-        raise ConfigurationError(f"--resets {strangers[0]}: there is {', '.join(FAULT_NAMES)}")
+        raise ConfigurationError(f"--resets {strangers[0]}: there is {', '.join(FAULT_LAWS)}")
     if not arguments.text.strip():
         raise ConfigurationError("TEXT: is empty; say what was done")
     when, now = arguments.when and _when(arguments.when), current_utc_text()
@@ -284,7 +282,7 @@ def _event(arguments: argparse.Namespace) -> None:
         actuator=arguments.actuator,
         usage=usage_from_options(arguments),
         text=valid_text(arguments.text),
-        resets=tuple(name for name in FAULT_NAMES if name in renewed.union(arguments.resets)),
+        resets=tuple(name for name in FAULT_LAWS if name in renewed.union(arguments.resets)),
     )
     with open_named_history(arguments) as history:
         event = replace(event, actuator=history.actuator_of(event.serial, event.actuator))

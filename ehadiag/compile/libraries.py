@@ -28,6 +28,7 @@ from ehadiag.compile.sources import (
     KERNEL_DIGEST,
     PREBUILT,
     SOURCE_DIGESTS_FILE,
+    cache_folder,
     cached,
     read_cached,
     source_hash,
@@ -116,6 +117,23 @@ def prepare(names: Iterable[str], progress: Callable[[str], None] = lambda _text
         for left, done in enumerate(as_completed(waiting), 1 - len(absent)):
             done.result()
             progress(f"compiled: {waiting[done]}, {-left} left")
+
+
+def compile_kernels(
+    notify: Callable[[str], None], *, simulation: bool = False, identification: bool = True
+) -> None:
+    """Compile the kernels that are needed and not there, several at a time.
+
+    notify: is given lines for who waits, none where nothing is compiled; simulation: whether
+    something is simulated; identification: whether something is identified.
+    """
+    needed = SIMULATION * simulation + IDENTIFICATION * identification
+    absent = missing(needed)
+    if absent:
+        kept = cache_folder() is not None
+        often = "once for this installation" if kept else "in memory, at each start"
+        notify(f"compiling the model's kernels ({', '.join(absent)}), {often}: up to a minute")
+        prepare(absent, notify)
 
 
 def missing(names: Iterable[str]) -> list[str]:

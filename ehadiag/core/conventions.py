@@ -78,6 +78,7 @@ DISPLAY_UNITS = {
     "N m/A": (1.0, "N mm/mA"),
     "Pa": (1e-6, "MPa"),
     "Pa/m": (1e-9, "MPa/mm"),
+    "m³": (1e6, "cm³"),
     "m²/s": (60.0, "L/min/mm"),
 }
 """Factor and unit by the SI unit; others are shown as they are."""

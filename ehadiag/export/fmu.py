@@ -33,7 +33,7 @@ from ehadiag.export.library import (
 )
 from ehadiag.export.targets import HOST, c_compiler, cross_compiler, link_shared
 from ehadiag.model.plant import plant_constants
-from ehadiag.model.severities import FAULT_LAWS
+from ehadiag.model.registry import FAULTS, REGISTRY
 from ehadiag.monitor.monitor_memory import (
     MONITOR,
     MONITOR_SIZE,
@@ -78,6 +78,7 @@ FMU_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "A": {"A": 1},
     "m": {"m": 1},
     "m/s": {"m": 1, "s": -1},
+    "m³": {"m": 3},
     "s": {"s": 1},
     "N": {"kg": 1, "m": 1, "s": -2},
     "N/m": {"kg": 1, "s": -2},
@@ -268,19 +269,12 @@ def _variables(
 
 
 VARIABLE_MEANINGS: Final[Mapping[str, tuple[str, str]]] = {
-    **{name: ("1", f"severity, 0 … 1: {law.meaning}") for name, law in FAULT_LAWS.items()},
-    "backlash": ("m", "half-width of the backlash at the feedback spring"),
+    **{item.condition or item.name: (item.unit, item.meaning) for item in REGISTRY},
+    **{item.name: ("1", f"severity, 0 … 1: {item.meaning}") for item in FAULTS},
     "oil_temperature": ("degC", "temperature of the oil"),
     "supply_pressure": ("Pa", "supply pressure"),
     "return_pressure": ("Pa", "return pressure"),
-    "spool_stribeck": ("m/s", "Stribeck velocity of the spool; 0: none"),
-    "jack_stribeck": ("m/s", "Stribeck velocity of the jack; 0: none"),
-    "load": ("N", "constant load on the jack"),
     "load_force": ("N", "force of another model on the jack, added to the load"),
-    "load_spring": ("N/m", "stiffness of a load spring"),
-    "filter_time": ("s", "time constant before the converters of spool and pressure"),
-    "hysteresis": ("1", "of the torque motor, over rated current"),
-    "null_bias": ("A", "of the torque motor"),
     "closed": ("1", "not 0: commands are positions, m; else currents, A"),
     "command": ("1", "A or m"),
     "current": ("A", "current, digitised"),
@@ -297,11 +291,9 @@ VARIABLE_MEANINGS: Final[Mapping[str, tuple[str, str]]] = {
     "predicted_position": ("m", "jack position by the model"),
     "viscosity": ("1", "of the oil, over that at 40 degC"),
     "supply": ("Pa", "supply minus return pressure"),
-    "spool_offset": ("m", "constant error of the spool's sensor"),
-    "pressure_offset": ("Pa", "constant error of the sensor of differential pressure"),
     "alarms": ("1", "sum of 1 (spool, upper), 2 (lower), 4 (pressure, upper), 8 (lower)"),
 }
-"""Unit of measure and meaning of a variable; those of no unit are named alone."""
+"""Unit of measure and meaning of a variable that is not named alone."""
 
 
 def export_fmus(

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.core.conventions import utc_text
@@ -27,7 +26,6 @@ from firmware_iface.errors import ConfigurationError, valid_text
 
 if TYPE_CHECKING:
     from ehadiag.result import Result
-    from firmware_iface.recording import Recording
 
 DIAGNOSIS_TABLE, EVENT_TABLE = "diagnosis", "event"
 """Kinds of what can be withdrawn, and their tables."""
@@ -311,30 +309,6 @@ def hash_of_file(path: str) -> str | None:
             return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError:
             return None
-
-
-def hash_of_samples(recording: Recording) -> str | None:
-    """Return the SHA-256 of the decoded samples: the same for a log, its packed copy or conversion.
-
-    Hexadecimal; None without samples. Times of arrival do not count: formats round them.
-    """
-    samples = recording.samples
-    if samples is None:
-        return None
-    out = hashlib.sha256(
-        f"{recording.test_id} {recording.serial} {samples.period_ns} {samples.mode}".encode()
-    )
-    for values in (
-        samples.command,
-        samples.current,
-        samples.spool,
-        samples.pressure,
-        samples.position,
-    ):
-        # One zero, one NaN: equal numbers have equal bits.
-        plain = np.where(np.isnan(values), np.nan, values + 0.0)
-        out.update(plain.astype("<f8").tobytes())
-    return out.hexdigest()
 
 
 def current_utc_text() -> str:

@@ -26,9 +26,9 @@ from ehadiag.history.records import (
     Entry,
     MaintenanceEvent,
     counted_entries,
-    hash_of_samples,
 )
 from ehadiag.history.schema import MIGRATION_STEPS, migrate, refuse_foreign_schema, schema_version
+from ehadiag.records import hash_of_samples
 from ehadiag.result import Result
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError, reason_of
 from firmware_iface.recording import Recording

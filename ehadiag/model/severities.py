@@ -45,6 +45,8 @@ class FaultLaw(NamedTuple):
     0.04 % (identification-results.md)."""
     needs_each_tick: bool
     """Whether only the response to single ticks of current shows it."""
+    parts: tuple[str, ...]
+    """Parts of a unit that end it when they are replaced."""
     pressure: str = ""
     """Field of a pressure gain that falls, too: by the share of `constant` that is left, to the
     power of the field `exponent` (PHY-45)."""
@@ -56,19 +58,19 @@ FAULT_LAWS: Final[dict[str, FaultLaw]] = {
         short="filter clogging", meaning="clogging of the valve's first-stage filter",
         constant="GQF", limit="", change=-0.8, first_search="slew", windows="Kintas",
         precision=1.0, search_std=2e-3, ambiguous_std=2e-3, further_std=2.4e-2,
-        needs_each_tick=True, pressure="GPF", exponent="CLE",
+        needs_each_tick=True, parts=("filter", "valve"), pressure="GPF", exponent="CLE",
     ),
     "FSS": FaultLaw(
         short="spool friction", meaning="dry friction between spool and sleeve",
         constant="FSS", limit="FSS1", change=0.0, first_search="creep", windows="FSS",
         precision=1.0, search_std=1e-3, ambiguous_std=7e-4, further_std=4e-2,
-        needs_each_tick=True,
+        needs_each_tick=True, parts=("valve",),
     ),
     "FDJ": FaultLaw(
         short="jack friction", meaning="dry friction between jack and cylinder",
         constant="FDJ", limit="FDJ1", change=0.0, first_search="jack", windows="FDJ",
         precision=0.2, search_std=4e-4, ambiguous_std=5e-5, further_std=1e-2,
-        needs_each_tick=False,
+        needs_each_tick=False, parts=("jack",),
     ),
 }  # fmt: skip
 """The progressive faults (PHY-13 to PHY-15), by name."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.report.head import LEAST_CHANCE, chance_text
 from firmware_iface.errors import printable
 
@@ -20,8 +21,7 @@ if TYPE_CHECKING:
 
 PROGNOSIS_SCHEMA = "ehadiag.rul/2"
 LEVEL_NAMES = ("advisory", "limit")
-SHORT_NAMES = {"Kintas": "filter clogging", "FSS": "spool friction", "FDJ": "jack friction"}
-"""Those of the registry, which loads the compiler."""
+SHORT_NAMES = {name: law.short for name, law in FAULT_LAWS.items()}
 AT_LIMIT = "at its limit"
 FIGURES = 2
 """Figures of a time that is printed, 1: an interval of 80 % carries no more."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import msgspec
 from msgspec.structs import replace
 
-from ehadiag.api import PathLike, log_if_compiling, setup_for
+from ehadiag.api import log_if_compiling, setup_for
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, LEAST_MONITORED
 from firmware_iface.errors import ConfigurationError, valid_text
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ehadiag.result import Result
     from ehadiag.session.monitor_session import AlarmOutlets, DecodedSource, MonitorSummary
     from ehadiag.session.unit_state import KnownUnit, UnitState
-    from ehadiag.setup import Setup
+    from ehadiag.setup import PathLike, Setup
     from firmware_iface.bus_map import BusMap
     from firmware_iface.bus_report import BusReport
     from firmware_iface.handshake import ChannelLimits

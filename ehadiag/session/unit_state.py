@@ -134,14 +134,13 @@ def _of_result(result: Result, actuator: Actuator, where: str) -> UnitState:
         )
     if fit is None:
         raise ConfigurationError(f"{where}: holds no severities, its test was not identified")
-    severities = tuple(
-        msgspec.structs.replace(result.severities[item.name], source=where)
-        for item in FAULTS
-        if item.name in result.severities
+    severities = tuple(  # one that a former version did not know was 0 in its model
+        msgspec.structs.replace(result.severities.get(item.name, item), source=where)
+        for item in new_unit_state(actuator).severities
     )
     numbers = [fit.spool_offset_mm, fit.pressure_offset_MPa, fit.spool_noise_mm]
     numbers += [fit.pressure_noise_MPa, *(item.estimate for item in severities)]
-    if len(severities) < len(FAULTS) or None in numbers:
+    if not result.severities or None in numbers:
         raise ConfigurationError(f"{where}: is none of ehadiag's JSON results")
     return UnitState(
         source=where,

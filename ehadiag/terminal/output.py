@@ -114,7 +114,7 @@ def transport_losses(transport: Transport) -> str:
 
 def print_compiling_notice(*, simulation: bool = False, identification: bool = True) -> None:
     """Compile kernels that are needed and not there, and print which."""
-    from ehadiag.api import compile_kernels  # noqa: PLC0415 - not for help texts
+    from ehadiag.compile.libraries import compile_kernels  # noqa: PLC0415 - not for help texts
 
     compile_kernels(print_status, simulation=simulation, identification=identification)
 

@@ -6,18 +6,17 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from firmware_iface.alignment.status import (
-    START_SCATTER_TICKS,
-    StatusTable,
-    contradictions,
-    main_time_base,
-)
+from firmware_iface.alignment.status import StatusTable
 from firmware_iface.alignment.ticks import TickAxis
 from firmware_iface.bus_map import BusMap
 from firmware_iface.codec import DecodedTable
 from firmware_iface.protection import NO_POSITION
 from firmware_iface.recording import MAX_GRID_TICKS, BitOutcome, BitReason, BitState, IntArray
 
+MIN_REPEATS = 2
+"""Times a value must be told to count: a damaged frame whose check sum fits tells it once."""
+START_SCATTER_TICKS = 20
+"""Ticks by which the first tick that status frames imply may scatter."""
 END_STATES = (BitState.COMPLETE, BitState.ABORTED)
 
 
@@ -310,3 +309,115 @@ def _without_ticks(status: StatusTable, index: int) -> Episode:
         serial=serial if serial >= 0 else None,
         outcome=BitOutcome(BitState(int(status.state[index])), _reason(status, index)),
     )
+
+
+def main_time_base(status: StatusTable, running: IntArray) -> tuple[IntArray, str]:
+    """Running frames of one time base, and what a second one beside it means; empty for none.
+
+    Each running frame implies the test's first tick. Tests that follow one another imply one after
+    the other; two first ticks in turn come from two senders.
+
+    status: all status frames, in columns; running: rows of `status` that say so and give the
+    elapsed time. Returns rows of one time base, and the reason against the recording (empty: none).
+    """
+    start = status.start[running].astype(np.int64)
+    order = np.argsort(start, kind="stable")
+    cuts = np.flatnonzero(np.diff(start[order]) > START_SCATTER_TICKS) + 1
+    groups = [np.sort(group) for group in np.split(order, cuts)]
+    groups = sorted((group for group in groups if len(group) >= MIN_REPEATS), key=len, reverse=True)
+    dropped = np.zeros(len(running), dtype=np.bool_)
+    kept: list[IntArray] = []
+    reason = ""
+    for group in groups:
+        beside = [
+            other
+            for other in kept
+            if np.count_nonzero((group > other[0]) & (group < other[-1])) >= MIN_REPEATS
+        ]
+        if not beside:
+            kept.append(group)
+            continue
+        dropped[group] = True
+        apart = int(np.median(start[group]) - np.median(start[beside[0]]))
+        reason = (
+            "the status tells of two time bases in turn, their tests begun"
+            f" {abs(apart)} ticks apart: a second sender of the status"
+        )
+    return running[~dropped], reason
+
+
+def contradictions(
+    status: StatusTable,
+    inside: IntArray,
+    final: int | None,
+    first: int,
+    stop: int,
+    test_id: int | None,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Reasons why what was said is not of one test on one unit, and notes on single odd frames.
+
+    status: all status frames, in columns; inside: rows of `status` between first and last tick;
+    final: row that told of the end; None without one; first: ticks of the test; stop: see `first`;
+    test_id: what the commands say; None: nothing. Returns reasons and notes, a sentence each.
+    """
+    counted = inside if final is None else np.append(inside[inside != final], final)
+    reasons, notes = [], []
+    for what, values, expected in (
+        ("serial number", status.serial[counted], None),
+        ("test number", _numbers(status, counted), test_id),
+    ):
+        reason, note = _one_value(what, values, expected, final is not None)
+        reasons += [reason] * bool(reason)
+        notes += [note] * bool(note)
+    amidst = inside[
+        (status.following[inside] > first + START_SCATTER_TICKS)
+        & (status.following[inside] < stop - START_SCATTER_TICKS)
+    ]
+    for state in (BitState.IDLE, BitState.ARMING):
+        count = int(np.count_nonzero(status.state[amidst] == state))
+        if count >= MIN_REPEATS:
+            reasons.append(f"the status says {state.name.lower()} {count} times amidst the test")
+    if np.any(status.state[amidst] == BitState.REFUSED):
+        notes.append("another request was refused while the test ran")
+    if final is not None:
+        later = np.arange(final + 1, len(status.row))
+        same = np.abs(status.start[later] - first) <= START_SCATTER_TICKS
+        count = int(np.count_nonzero((status.state[later] == BitState.RUNNING) & same))
+        if count >= MIN_REPEATS:
+            word = BitState(int(status.state[final])).name.lower()
+            reasons.append(f"the status says that the test runs after it was {word}")
+    return tuple(reasons), tuple(notes)
+
+
+def _numbers(status: StatusTable, counted: IntArray) -> IntArray:
+    """Test numbers of frames that speak of a test; -1 for the others."""
+    speaks = np.isin(status.state[counted], (BitState.RUNNING, BitState.COMPLETE))
+    return np.where(speaks, status.test_id[counted], -1)
+
+
+def _one_value(what: str, values: IntArray, expected: int | None, ends: bool) -> tuple[str, str]:
+    """Reason and note on a value that must not change; `ends`: the last frame weighs."""
+    known = values[values >= 0]
+    unique, count = np.unique(known, return_counts=True)
+    if len(unique) == 0:
+        return "", ""
+    usual = int(unique[np.argmax(count)])
+    if expected is not None and usual != expected:
+        return f"commands say {what} {expected}, the status {usual}", ""
+    odd = [int(value) for value, times in zip(unique, count, strict=True) if times >= MIN_REPEATS]
+    odd = [value for value in odd if value != usual]
+    last = int(values[-1])
+    if ends and last >= 0 and last != usual and last not in odd:
+        odd.append(last)
+    if odd:
+        # More changes to and fro: two senders in turn.
+        if np.count_nonzero(np.diff(known[np.isin(known, [usual, *odd])])) > 2:
+            return (
+                f"the status tells {what} {usual} and {odd[0]} in turn: a second sender of the"
+                " status"
+            ), ""
+        return f"the {what} changes within the test: {usual} and {odd[0]}", ""
+    if len(unique) > 1:
+        other = int(unique[unique != usual][0])
+        return "", f"one status frame says {what} {other}, all others {usual}"
+    return "", ""

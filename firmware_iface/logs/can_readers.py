@@ -20,7 +20,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Self, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from firmware_iface.errors import InputOutputError, install_command
 from firmware_iface.logs.log_files import DamagedLogError, Spending
@@ -285,35 +285,6 @@ def _open_mf4(path: Path) -> Any:
             return mf4_library().MF4Reader(file)
     except NotImplementedError:
         raise InputOutputError(f"log {path}: MF4 needs asammdf: {install_command('mf4')}") from None
-
-
-class SkippedLines(logging.Handler):
-    """Counts what python-can's readers skip with no more than a line in its own log.
-
-    And keeps quiet the destructor of asammdf, which fails where its constructor failed.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.count = 0
-        self._hook = sys.unraisablehook
-
-    def emit(self, _: logging.LogRecord) -> None:
-        """Count a complaint."""
-        self.count += 1
-
-    def __enter__(self) -> Self:
-        logging.getLogger("can").addHandler(self)
-        sys.unraisablehook = self._pass_on
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        logging.getLogger("can").removeHandler(self)
-        sys.unraisablehook = self._hook
-
-    def _pass_on(self, what: Any) -> None:
-        if not getattr(what.object, "__module__", "").startswith("asammdf."):
-            self._hook(what)
 
 
 BAD_LINES = logging.getLogger("can.lines")

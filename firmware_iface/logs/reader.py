@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+import sys
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from msgspec.structs import replace
@@ -12,7 +15,6 @@ from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
 from firmware_iface.find_test import CandidateTests
-from firmware_iface.logs.can_readers import SkippedLines
 from firmware_iface.logs.log_files import (
     Budget,
     DamagedLogError,
@@ -108,10 +110,10 @@ class FrameLog:
                 return str(error)
             except EhadiagError:
                 raise
-            except Exception:
+            except Exception as error:
                 if not self._origin:
                     raise
-                return "the log breaks off or is damaged"
+                return f"the log breaks off or is damaged: {type(error).__name__} in its reader"
             if table is None:
                 return ""
             if not isinstance(table, FrameTable):
@@ -119,6 +121,35 @@ class FrameLog:
             self._spending.add_frames(len(table))
             stamps.take(table.time_ns)
             yield table
+
+
+class SkippedLines(logging.Handler):
+    """Counts what python-can's readers skip with no more than a line in its own log.
+
+    And keeps quiet the destructor of asammdf, which fails where its constructor failed.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.count = 0
+        self._hook = sys.unraisablehook
+
+    def emit(self, _: logging.LogRecord) -> None:
+        """Count a complaint."""
+        self.count += 1
+
+    def __enter__(self) -> Self:
+        logging.getLogger("can").addHandler(self)
+        sys.unraisablehook = self._pass_on
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("can").removeHandler(self)
+        sys.unraisablehook = self._hook
+
+    def _pass_on(self, what: Any) -> None:
+        if not getattr(what.object, "__module__", "").startswith("asammdf."):
+            self._hook(what)
 
 
 MAX_STANDING = 0.5

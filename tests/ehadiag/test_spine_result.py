@@ -7,6 +7,7 @@ import csv
 import json
 import math
 import pickle
+import re
 from dataclasses import fields
 from importlib import resources
 from pathlib import Path
@@ -28,8 +29,9 @@ from ehadiag.batch.result_files import (
     result_columns,
     result_row,
 )
+from ehadiag.core.actuator import Actuator
 from ehadiag.estimate import Effect
-from ehadiag.export.fmu import monitor_variables
+from ehadiag.export.fmu import FMU_UNITS, actuator_variables, monitor_variables
 from ehadiag.history.records import Usage, history_entry
 from ehadiag.history.store import History
 from ehadiag.identify.identification_result import Nuisance
@@ -220,7 +222,8 @@ def test_every_parameter_reaches_every_output(everything: Result, tmp_path: Path
             take(everything)
         content = files[suffix].read_bytes()
         for name in (*severities, *effects):
-            assert name.encode() in content, f"{name} is missing in {suffix}"
+            whole = rb"(?<![A-Za-z_])" + name.encode() + rb"(?![A-Za-z_])"
+            assert re.search(whole, content), f"{name} is missing in {suffix}"
         assert is_result_table(files[suffix]) == (suffix in TABLE_FORMATS)
     (row,) = csv.DictReader(files[".csv"].read_text(encoding="utf-8").splitlines())
     parquet = pytest.importorskip("pyarrow.parquet").read_table(files[".parquet"]).to_pylist()[0]
@@ -243,6 +246,18 @@ def test_every_parameter_reaches_every_output(everything: Result, tmp_path: Path
     assert set(known.effects) == effects - {item.name for item in SENSOR_OFFSETS}
 
 
+def assert_same_laws(values: dict[str, float], effects: Effects, actuator: Actuator) -> None:
+    """Of simulator and model: what both name has the same size with these values."""
+    free = Unknowns(tuple(map(parameter, values)), (plant_constants(actuator),), {})
+    constants = free.constants(np.array(list(values.values())))._asdict()
+    faults = Faults(**{name: value for name, value in values.items() if name in FAULT_LAWS})
+    coefficients = plant_coefficients(actuator, faults, effects)._asdict()
+    both = constants.keys() & coefficients.keys()
+    assert {name: constants[name] for name in both} == pytest.approx(
+        {name: coefficients[name] for name in both}, rel=1e-9, abs=0.0
+    )
+
+
 def test_every_severity_reaches_simulator_monitor_and_exports() -> None:
     names = tuple(item.name for item in FAULTS)
     assert tuple(field.name for field in fields(Faults)) == names
@@ -255,19 +270,27 @@ def test_every_severity_reaches_simulator_monitor_and_exports() -> None:
         plant_coefficients(default_actuator(), faults, Effects()) for faults in (Faults(), worn)
     )
     assert sum(a != b for a, b in zip(new, damaged, strict=True)) >= len(names)
+    assert_same_laws(dict.fromkeys(names, 0.5), Effects(), default_actuator())
     windows = bundled_tests()["open"].windows.__struct_fields__
     assert all(law.windows in windows for law in FAULT_LAWS.values())
 
 
-@pytest.mark.parametrize("item", [item for item in EFFECTS if item.basic], ids=lambda x: x.name)
+FREED = [item for item in EFFECTS if item.basic or item.limit]
+
+
+@pytest.mark.parametrize("item", FREED, ids=lambda item: item.name)
 def test_every_effect_that_is_freed_has_a_limit_and_is_simulated(item: Parameter) -> None:
     actuator = default_actuator()
+    assert item.basic
     assert item.limit_of(actuator) is not None
     stage = msgspec.structs.replace(actuator.second_stage, kind="orifice")
     actuator = msgspec.structs.replace(actuator, second_stage=stage)
     name = item.condition or item.name
     assert name in {option.field for option in condition_options(Effects)}
+    assert (name, item.unit) in {(shown.name, shown.unit) for shown in actuator_variables()}
+    assert item.unit in FMU_UNITS
     changed = Effects(**{name: 0.3 * item.scale})
+    assert_same_laws({item.name: 0.3 * item.scale}, changed, actuator)
     plants = (
         Plant(actuator, Faults(), effects, Sensors(noise_lsb=0.0))
         for effects in (Effects(), changed)
@@ -286,7 +309,7 @@ def test_the_columns_of_former_tables_are_still_there(result: Result) -> None:
         "FDJ_std", "FDJ_low95", "FDJ_high95", "spool_rms", "pressure_rms", "oil_temperature_degC",
         "supply_pressure_MPa", "frames", "lost", "total_s", "reasons", "notes", "error",
     ]  # fmt: skip
-    assert list(result_columns())[: len(former)] == former
+    assert [name for name in result_columns() if name in former] == former
     row = result_row(result)
     assert row["oil_temperature_degC"] == 40.0
     assert row["frames"] == 11331
@@ -333,6 +356,17 @@ def test_a_former_result_in_a_history_is_watched_with_all_its_effects(tmp_path: 
     assert known is not None
     assert known.effects["load"] == 12.0
     assert known.effects["null_bias"] == read.effects[0].value
+
+
+def test_a_severity_that_a_former_version_did_not_know_is_watched_as_new() -> None:
+    read = Result.from_json(LINES[1])
+    severities = {name: item for name, item in read.severities.items() if name != "FDJ"}
+    known = unit_state_of(
+        msgspec.structs.replace(read, severities=severities), ehadiag.default_actuator()
+    )
+    found = {item.name: item.value for item in known.severities}
+    assert found["FSS"] == read.severities["FSS"].value
+    assert found["FDJ"] == 0.0
 
 
 def test_the_table_names_an_effect_only_where_it_says_something(everything: Result) -> None:

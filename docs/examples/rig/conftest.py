@@ -3,7 +3,7 @@
 import pytest
 
 import ehadiag
-from ehadiag.api import resolve_bus_map
+from ehadiag.setup import resolve_bus_map
 from ehadiag_sim.conditions import DataErrors, Effects, Faults
 from ehadiag_sim.emulator import EmulatorTransport, emulated_computer
 

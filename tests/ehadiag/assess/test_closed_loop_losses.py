@@ -13,10 +13,10 @@ from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Diagnosis, Recording, Verdict, bundled_tests, default_actuator
+from ehadiag.assess.acceptance import objection_to_frame_order
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.lost_samples import (
     is_reconstructible,
-    objection_to_frame_order,
     reconstruct_lost_samples,
 )
 from ehadiag.assess.response_checks import (

@@ -269,13 +269,6 @@ def test_a_cover_of_fleets_own_lives() -> None:
     assert 0.65 < np.mean(inside) < 0.98
 
 
-def test_sentences_have_the_names_of_the_registry() -> None:
-    from ehadiag.model.registry import FAULTS
-    from ehadiag.report.prognosis_tables import SHORT_NAMES
-
-    assert {item.name: item.short for item in FAULTS} == SHORT_NAMES
-
-
 def test_hours_of_a_swapped_unit_count_anew() -> None:
     def tested(n: int, hours: float, *values: float) -> Entry:
         return an_entry(7, hours, values, tested=f"2026-{1 + n // 28:02}-{1 + n % 28:02}T12:00:00Z")
