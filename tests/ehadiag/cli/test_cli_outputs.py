@@ -160,6 +160,7 @@ def test_full_disk_for_the_recording(suffix: str, run: Run, tiny_disk: Path) -> 
     assert len(read_frames(path)) > 500
 
 
+@pytest.mark.usefixtures("undrawn")
 @posix
 @pytest.mark.parametrize("suffix", [".json", ".png"])
 def test_a_planted_link_is_not_followed(suffix: str, run: Run, tmp_path: Path) -> None:
@@ -269,6 +270,7 @@ def test_names_in_an_actuator_file_are_text(name: str, run: Run, tmp_path: Path)
     assert found["actuator"] == name
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_equal_names_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> None:
     """In one call, and in calls one after the other; the same recording gives its result anew."""
     for folder, log in (("a", HEALTHY), ("b", WORN)):
@@ -286,6 +288,7 @@ def test_equal_names_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> No
     assert len(list(Path("p").iterdir())) == 4
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_file_that_is_no_result_is_not_overwritten(run: Run) -> None:
     Path("o").mkdir()
     for name in ("healthy-open.json", "healthy-open-2.png", "healthy-open-3.json"):
@@ -295,6 +298,7 @@ def test_a_file_that_is_no_result_is_not_overwritten(run: Run) -> None:
     assert Path("o/healthy-open.json").read_text() == "[1]"
 
 
+@pytest.mark.usefixtures("undrawn")
 @posix
 def test_permissions(run: Run) -> None:
     before = os.umask(0o027)
