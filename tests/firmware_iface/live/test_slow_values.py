@@ -272,7 +272,7 @@ def noise(rng: np.random.Generator, how: str, count: int) -> NDArray[np.float64]
     return rng.uniform(-3.0, 3.0, count) + rng.normal(0.0, 0.5, count)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("how", ["uniform", "normal"])
 @pytest.mark.parametrize("path", ["80 degC", "-20 to 80 degC in 140 s", "a step of 20 K"])
 def test_noise_about_one_value_that_moves_is_no_second_sender(
@@ -289,7 +289,7 @@ def test_noise_about_one_value_that_moves_is_no_second_sender(
     assert told_conflicts(list(zip(oil.tolist(), supply.tolist(), strict=True))) == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("how", ["uniform", "normal"])
 @pytest.mark.parametrize(("other", "drift"), [(8.0, 0.0), (-25.0, 0.0), (25.0, 0.7)])
 @pytest.mark.parametrize("share", [0.5, 0.25])
@@ -303,7 +303,7 @@ def test_two_senders_farther_apart_than_their_noise_are_seen(
     assert conflicts > (0.5 if share == 0.5 else 0.3) * count
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_two_senders_within_their_noise_say_nothing(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 400
     oil = 40.0 + 3.0 * (np.arange(count) % 2) + noise(rng, "normal", count)
