@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from bus_synth import play
+from live_ends import cable
 from places import LOGS
 
 from firmware_iface.bus_map import default_map
@@ -27,3 +30,9 @@ def frames(encoder, truth):
 @pytest.fixture(scope="session")
 def logs():
     return LOGS
+
+
+@pytest.fixture
+def wire() -> Iterator[tuple[str, str]]:
+    with cable() as ends:
+        yield ends

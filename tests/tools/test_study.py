@@ -75,7 +75,7 @@ def test_finished_cases_are_not_performed_again(tmp_path: Path) -> None:
 
 def test_worker_processes_give_the_same_records() -> None:
     study = next(item for item in STUDIES if item.name == "prognosis")
-    options_ = Options(cases=2, seed=1, laws="tuned", fleet=4, censored=False)
+    options_ = Options(cases=2, seed=1, laws="tuned", fleet=2, censored=False)
     cases = study.cases(options_)
     assert perform_cases(study, cases, None, 2) == perform_cases(study, cases, None, 1)
 

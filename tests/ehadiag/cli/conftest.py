@@ -43,6 +43,14 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
 
 
 @pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures and pages are files of a few bytes: what they show is tested beside them."""
+    monkeypatch.setattr("ehadiag.report.matplotlib_figures.picture_png", lambda _: b"\x89PNG")
+    for page in ("diagnosis_page", "calibration_page"):
+        monkeypatch.setattr(f"ehadiag.report.report_pages.{page}", lambda *_: "<html>")
+
+
+@pytest.fixture
 def environment() -> dict[str, str]:
     """Environment of a child process, without a bus."""
     return {key: value for key, value in os.environ.items() if not key.startswith("CAN_")}

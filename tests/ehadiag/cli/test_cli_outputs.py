@@ -160,6 +160,7 @@ def test_full_disk_for_the_recording(suffix: str, run: Run, tiny_disk: Path) -> 
     assert len(read_frames(path)) > 500
 
 
+@pytest.mark.usefixtures("undrawn")
 @posix
 @pytest.mark.parametrize("suffix", [".json", ".png"])
 def test_a_planted_link_is_not_followed(suffix: str, run: Run, tmp_path: Path) -> None:
@@ -210,19 +211,16 @@ ODD_NAMES = [
 
 
 @posix
-def test_odd_names(tmp_path: Path, environment: dict[str, str]) -> None:
+def test_odd_names(run: Run, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for name, _, _ in ODD_NAMES:
         shutil.copy(os.fsencode(HEALTHY), os.path.join(os.fsencode(tmp_path), b"in", name))
-    given = [os.path.join(b"in", name) for name, _, _ in ODD_NAMES]
-    command = [*COMMAND, "diagnose", "--jobs", "1", "--out"]
-    table = subprocess.run(
-        [*command, "o", "--no-picture", *given],
-        cwd=tmp_path, env=environment, capture_output=True, check=True,
-    )  # fmt: skip
-    shown = [line for line in table.stdout.decode().splitlines() if "recording in/" in line]
+    given = [f"in/{os.fsdecode(name)}" for name, _, _ in ODD_NAMES]
+    table = run("diagnose", "--jobs", 1, "--out", "o", "--no-picture", *given)
+    assert table.code == 0
+    shown = [line for line in table.out.splitlines() if "recording in/" in line]
     assert shown == [f"  recording in/{item}" for _, _, item in ODD_NAMES]
-    assert b"\x1b" not in table.stdout + table.stderr
+    assert "\x1b" not in table.out + table.err
     sources = {
         stem: "in/" + name.decode("utf-8", "backslashreplace") for name, stem, _ in ODD_NAMES
     }
@@ -230,11 +228,9 @@ def test_odd_names(tmp_path: Path, environment: dict[str, str]) -> None:
         path.stem: json.loads(path.read_text())["source"] for path in (tmp_path / "o").iterdir()
     }
     drawn = {stem: sources[stem] for _, stem, _ in ODD_NAMES[-3:]}
-    found = subprocess.run(
-        [*command, "p", "--json", *given[-3:]],
-        cwd=tmp_path, env=environment, capture_output=True, check=True,
-    )  # fmt: skip
-    assert [json.loads(line)["source"] for line in found.stdout.splitlines()] == [*drawn.values()]
+    found = run("diagnose", "--jobs", 1, "--out", "p", "--json", *given[-3:])
+    assert found.code == 0
+    assert [item["source"] for item in found.objects] == [*drawn.values()]
     written = [f"{stem}{suffix}" for stem in drawn for suffix in (".json", ".png")]
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted(written)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "o", "p"]
@@ -274,6 +270,7 @@ def test_names_in_an_actuator_file_are_text(name: str, run: Run, tmp_path: Path)
     assert found["actuator"] == name
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_equal_names_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> None:
     """In one call, and in calls one after the other; the same recording gives its result anew."""
     for folder, log in (("a", HEALTHY), ("b", WORN)):
@@ -291,6 +288,7 @@ def test_equal_names_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> No
     assert len(list(Path("p").iterdir())) == 4
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_file_that_is_no_result_is_not_overwritten(run: Run) -> None:
     Path("o").mkdir()
     for name in ("healthy-open.json", "healthy-open-2.png", "healthy-open-3.json"):
@@ -300,11 +298,12 @@ def test_a_file_that_is_no_result_is_not_overwritten(run: Run) -> None:
     assert Path("o/healthy-open.json").read_text() == "[1]"
 
 
+@pytest.mark.usefixtures("undrawn")
 @posix
 def test_permissions(run: Run) -> None:
     before = os.umask(0o027)
     try:
-        run(*FAST, "--out", "o")
+        run("diagnose", "--report", "--out", "o", HEALTHY)
     finally:
         os.umask(before)
     assert Path("o").stat().st_mode & 0o777 == 0o750

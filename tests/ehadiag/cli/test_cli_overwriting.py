@@ -117,6 +117,7 @@ def test_exports_of_a_history_do_not_replace_it(
     assert len(run("history", "list", "--json", "--history", name).objects) == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_replaces_neither_a_result_nor_another_report(place: Path, run: Run) -> None:
     run("diagnose", "v.blf", "--json", "--out", ".", "--no-picture")
     shutil.copy("v.json", "r.html")
@@ -181,6 +182,7 @@ def test_alarms_are_appended_to_nothing_that_is_read(
     assert contents(place) == before
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_result_leaves_other_files_of_its_folder_alone(place: Path, run: Run) -> None:
     """The page of somebody else, and the summary that the same call writes there."""
     shutil.copy(WORN, "w.blf")

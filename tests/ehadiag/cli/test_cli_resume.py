@@ -108,6 +108,7 @@ def reused(run: Run, *arguments: object) -> int:
     return found
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_a_call_is_to_write_is_written_of_earlier_results_too(
     jobs: int, run: Run, logs: None

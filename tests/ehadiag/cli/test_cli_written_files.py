@@ -131,6 +131,7 @@ def written(kind: str, folder: Path, stem: str = "x") -> tuple[Path, list[str]]:
     return path, [item.format(str(path).removesuffix(".lock")) for item in arguments]
 
 
+@pytest.mark.usefixtures("undrawn")
 @posix
 @pytest.mark.parametrize("there", [True, False])
 @pytest.mark.parametrize("kind", WRITTEN)
@@ -147,6 +148,7 @@ def test_a_link_in_its_place_is_not_followed(kind: str, there: bool, place: Path
     assert "Traceback" not in result.err
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("kind", [item for item in WRITTEN if item != "lock of results"])
 def test_a_full_disk_is_said_and_leaves_nothing_half_written(
     kind: str, place: Path, run: Run, tiny_disk: Path

@@ -1,9 +1,8 @@
-"""MDF4 and MCAP files of a result, as asammdf and mcap read them in processes of their own."""
+"""MDF4 and MCAP files of a result, as asammdf and mcap read them."""
 
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Iterator
 from functools import lru_cache
@@ -11,8 +10,10 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import asammdf
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from msgspec.structs import replace
 from places import LOGS, ROOT
 
@@ -25,44 +26,36 @@ from firmware_iface.errors import ConfigurationError, NotTestedError
 WORN = LOGS / "paper-closed-4.blf"
 LAYOUTS = ROOT / "examples" / "layouts"
 DBC = (ROOT / "firmware_iface" / "data" / "eha_fcc.dbc").read_bytes()
-READ_MDF4 = """
-import json, sys, asammdf
-with asammdf.MDF(sys.argv[1]) as mdf:
-    groups = [
-        {c.name: [c.unit, mdf.get(c.name, group=n).samples.tolist()] for c in group.channels}
-        for n, group in enumerate(mdf.groups)
-    ]
-    events = [[e.value, e.name, e.comment, e.scopes] for e in mdf.events]
-    attached = {
-        str(a.file_name): mdf.extract_attachment(n)[0].decode()
-        for n, a in enumerate(mdf.attachments)
-    }
-    print(json.dumps([groups, events, attached, mdf.header._common_properties,
-                      mdf.header.start_time.timestamp()]))
-"""
-READ_MCAP = """
-import json, sys
-from mcap.reader import make_reader
-with open(sys.argv[1], "rb") as file:
-    reader = make_reader(file, validate_crcs=True)
-    topics = {}
-    for schema, channel, message in reader.iter_messages():
-        assert channel.message_encoding == "json" and schema.encoding == "jsonschema"
-        fields = list(json.loads(schema.data)["properties"])
-        topic = topics.setdefault(channel.topic, [schema.name, fields, []])
-        topic[2].append([message.log_time, json.loads(message.data)])
-    attached = {item.name: item.data.decode() for item in reader.iter_attachments()}
-    metadata = {item.name: item.metadata for item in reader.iter_metadata()}
-    print(json.dumps([topics, attached, metadata]))
-"""
 
 
-def read_by(script: str, path: Path) -> Any:
-    """Read a file by a script in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(path)], capture_output=True, check=True, timeout=120
-    )
-    return json.loads(done.stdout)
+def read_mdf4(path: Path) -> tuple[Any, ...]:
+    """Channels of each group, events, attachments, properties and start of a file, by asammdf."""
+    with asammdf.MDF(path) as mdf:
+        groups = [
+            {c.name: (c.unit, mdf.get(c.name, group=n).samples) for c in group.channels}
+            for n, group in enumerate(mdf.groups)
+        ]
+        events = [(e.value, e.name, e.comment, tuple(e.scopes)) for e in mdf.events]
+        attached = {
+            str(a.file_name): mdf.extract_attachment(n)[0].decode()
+            for n, a in enumerate(mdf.attachments)
+        }
+        properties = dict(mdf.header._common_properties)
+        return groups, events, attached, properties, mdf.header.start_time.timestamp()
+
+
+def read_mcap(path: Path) -> tuple[Any, ...]:
+    """Messages of each topic, attachments and metadata of a file, by mcap."""
+    topics: dict[str, Any] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages():
+            assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
+            fields = list(json.loads(schema.data)["properties"])
+            topic = topics.setdefault(channel.topic, (schema.name, fields, []))
+            topic[2].append((message.log_time, json.loads(message.data)))
+        attached = {item.name: item.data.decode() for item in reader.iter_attachments()}
+        return topics, attached, {item.name: item.metadata for item in reader.iter_metadata()}
 
 
 @lru_cache(maxsize=1)
@@ -122,7 +115,7 @@ def check_values(values: dict[str, Any], result: Result, unit_of: dict[str, str]
 def test_asammdf_reads_signals_events_and_attachments(result: Any, tmp_path: Path) -> None:
     found = result()
     found.write_signals(tmp_path / "test.mf4")
-    (group,), events, attached, properties, start = read_by(READ_MDF4, tmp_path / "test.mf4")
+    (group,), events, attached, properties, start = read_mdf4(tmp_path / "test.mf4")
     if result is worn:
         check_values(
             {k: v for k, (_, v) in group.items()}, found, {k: u for k, (u, _) in group.items()}
@@ -130,7 +123,7 @@ def test_asammdf_reads_signals_events_and_attachments(result: Any, tmp_path: Pat
     assert [(at, name, signal) for at, name, signal, _ in events] == [
         (pytest.approx(at, abs=1e-9), name, signal) for at, name, signal in expected_events(found)
     ]
-    assert all(scopes == [0] for *_, scopes in events)
+    assert all(scopes == (0,) for *_, scopes in events)
     names = {name for _, name, _, _ in events}
     assert "break-away" in names
     assert ("re-anchoring" in names) is (result is mismodelled)
@@ -144,7 +137,7 @@ def test_asammdf_reads_signals_events_and_attachments(result: Any, tmp_path: Pat
 def test_mcap_reads_what_foxglove_plots(tmp_path: Path) -> None:
     found, path = worn(), tmp_path / "test.mcap"
     found.write_signals(path)
-    topics, attached, metadata = read_by(READ_MCAP, path)
+    topics, attached, metadata = read_mcap(path)
     units = {"uA": "µA", "um": "µm"}
     values, unit_of, begin = {}, {}, found.recordings[0].start_ns
     for signal in RESPONSE_SIGNALS:
@@ -181,12 +174,15 @@ def panels_of(node: Any) -> Iterator[str]:
 def test_layouts_name_signals_that_a_file_has(tmp_path: Path) -> None:
     worn().write_signals(tmp_path / "closed.mcap")
     ehadiag.diagnose(LOGS / "paper-open-4.blf").write_signals(tmp_path / "open.mcap")
-    known = set()
+    topics, known = set(), set()
     for name in ("closed.mcap", "open.mcap"):  # the command is another signal's in each
-        topics, _, _ = read_by(READ_MCAP, tmp_path / name)
-        known |= {
-            f"{topic}/{field}" for topic, (_, fields, _) in topics.items() for field in fields
-        }
+        with (tmp_path / name).open("rb") as file:
+            summary = make_reader(file).get_summary()
+        for number in summary.statistics.channel_message_counts:
+            channel = summary.channels[number]
+            topics.add(channel.topic)
+            fields = json.loads(summary.schemas[channel.schema_id].data)["properties"]
+            known |= {f"{channel.topic}/{field}" for field in fields}
     foxglove = json.loads((LAYOUTS / "foxglove.json").read_text())
     panels = foxglove["configById"]
     assert sorted(panels_of(foxglove["layout"])) == sorted(panels)
@@ -208,10 +204,10 @@ def test_recordings_of_a_joint_result_keep_their_times(tmp_path: Path) -> None:
     joint = ehadiag.diagnose([LOGS / "paper-open-4.blf", WORN])
     joint.write_signals(tmp_path / "joint.mf4")
     joint.write_signals(tmp_path / "joint.mcap")
-    groups, events, *_ = read_by(READ_MDF4, tmp_path / "joint.mf4")
+    groups, events, *_ = read_mdf4(tmp_path / "joint.mf4")
     assert [len(group["time"][1]) for group in groups] == [5500, 5500]
-    assert {tuple(scopes) for *_, scopes in events} == {(0,), (1,)}
-    topics, *_ = read_by(READ_MCAP, tmp_path / "joint.mcap")
+    assert {scopes for *_, scopes in events} == {(0,), (1,)}
+    topics, *_ = read_mcap(tmp_path / "joint.mcap")
     starts = [item.start_ns or 0 for item in joint.recordings]
     assert [topics[f"{name}/spool"][2][0][0] for name in ("", "/2")] == starts
     first = min(starts)
@@ -227,7 +223,7 @@ def test_without_an_estimate_the_response_of_a_unit_as_new_is_written(tmp_path: 
     result = ehadiag.diagnose(half)
     assert not result.identified
     result.write_signals(tmp_path / "half.mf4")
-    (group,), events, _, properties, _ = read_by(READ_MDF4, tmp_path / "half.mf4")
+    (group,), events, _, properties, _ = read_mdf4(tmp_path / "half.mf4")
     assert {"spool.measured", "spool.expected", "spool.residual"} <= set(group)
     assert "spool.deviation" not in group
     assert (events, properties["verdict"]) == ([], "NOT_TESTED")

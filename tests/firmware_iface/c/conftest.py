@@ -1,16 +1,14 @@
-"""The C side, built once with all warnings as errors, and a pair of pseudo-terminals."""
+"""The C side, built once with all warnings as errors."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import c_side
 import pytest
-from live_ends import cable
 
 
 @pytest.fixture(scope="session")
@@ -33,9 +31,3 @@ def c_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def library(c_build: Path) -> Any:
     return c_side.load(c_build / "libfcc.so")
-
-
-@pytest.fixture
-def wire() -> Iterator[tuple[str, str]]:
-    with cable() as ends:
-        yield ends

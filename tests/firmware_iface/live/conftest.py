@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 
 import fault_cases
 import pytest
-from live_ends import cable
 
 from ehadiag import StoredTest, default_actuator
 from ehadiag_sim.conditions import Faults
@@ -36,9 +35,3 @@ def _no_thread_left() -> Iterator[None]:
     yield
     left = [item.name for item in threading.enumerate() if item not in before and item.is_alive()]
     assert not left, f"threads left running: {left}"
-
-
-@pytest.fixture
-def wire() -> Iterator[tuple[str, str]]:
-    with cable() as ends:
-        yield ends

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import socket
-from collections.abc import Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -27,16 +26,6 @@ class TestMulticast(TwoWay):
     @pytest.fixture
     def options(self) -> BusOptions:
         return BusOptions("udp_multicast")
-
-    @pytest.fixture
-    def other(self, options: BusOptions) -> Iterator[Transport]:
-        with PythonCanTransport(options, transmit=True) as transport:
-            yield transport
-
-    @pytest.fixture
-    def receiving(self, options: BusOptions) -> Iterator[Transport]:
-        with PythonCanTransport(options) as transport:
-            yield transport
 
     def test_what_is_no_frame_degrades_and_does_not_end_the_bus(
         self, receiving: Transport, other: Transport

@@ -34,7 +34,7 @@ def frames_of(encoder: Encoder, idle_before: int = 1200, shift_ns: int = 0, **op
 
 
 @pytest.mark.parametrize("first", [0, 1])
-@pytest.mark.parametrize("idle_before", [80, 600, 1200, 2500, 6000])
+@pytest.mark.parametrize("idle_before", [80, 1200, 6000])
 def test_a_restart_with_a_change_of_state_is_no_second_sender(idle_before: int, first: int) -> None:
     frames = frames_of(RestartingEncoder(first), idle_before)
     decoder = LiveDecoder(BUS)

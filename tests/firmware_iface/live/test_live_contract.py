@@ -132,7 +132,20 @@ class Contract:
 
 
 class TwoWay(Contract):
-    """Transports with another end that can be written to, and read: the fixture `other`."""
+    """Transports with another end that can be written to, and read: the fixture `other`.
+
+    Both ends are of the fixture `options`, where a subclass does not give them.
+    """
+
+    @pytest.fixture
+    def other(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options) as transport:
+            yield transport
 
     @pytest.fixture
     def passed(self, receiving: Transport, other: Transport) -> Callable[[], list[Frame]]:
@@ -172,16 +185,6 @@ class TestVirtual(TwoWay):
     @pytest.fixture
     def options(self) -> BusOptions:
         return BusOptions("virtual", channel=str(uuid.uuid4()))
-
-    @pytest.fixture
-    def other(self, options: BusOptions) -> Iterator[Transport]:
-        with PythonCanTransport(options, transmit=True) as transport:
-            yield transport
-
-    @pytest.fixture
-    def receiving(self, options: BusOptions) -> Iterator[Transport]:
-        with PythonCanTransport(options) as transport:
-            yield transport
 
 
 @pytest.mark.parametrize(
@@ -537,16 +540,6 @@ class TestSocketCan(TwoWay):
         if "vcan0" not in {name for _, name in socket.if_nameindex()}:
             pytest.skip("no vcan0 here")
         return BusOptions("socketcan", channel="vcan0")
-
-    @pytest.fixture
-    def other(self, options: BusOptions) -> Iterator[Transport]:
-        with PythonCanTransport(options, transmit=True) as transport:
-            yield transport
-
-    @pytest.fixture
-    def receiving(self, options: BusOptions) -> Iterator[Transport]:
-        with PythonCanTransport(options) as transport:
-            yield transport
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux tells what a socket dropped")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -54,9 +55,13 @@ def second(times_ms: Iterable[float], first: int, degc: float, supply: float) ->
     ]
 
 
+@cache
+def ours() -> tuple[Frame, ...]:
+    return tuple(play(Encoder(BUS), make_truth(TEST_TICKS)))
+
+
 def mixed(theirs: list[Frame]) -> list[Frame]:
-    ours = play(Encoder(BUS), make_truth(TEST_TICKS))
-    return sorted([*ours, *theirs], key=lambda item: item.time_ns)
+    return sorted([*ours(), *theirs], key=lambda item: item.time_ns)
 
 
 ATTACKS = {
@@ -68,17 +73,29 @@ ATTACKS = {
 }
 
 
-@pytest.mark.parametrize("attack", ATTACKS)
-@pytest.mark.parametrize(("degc", "supply"), [(15.0, 20.7e6), (40.0, 17.0e6), (37.0, 20.0e6)])
+@pytest.mark.parametrize(
+    ("attack", "degc", "supply"),
+    [
+        ("more than ours", 15.0, 20.7e6),
+        ("more than ours", 40.0, 17.0e6),
+        *((attack, 37.0, 20.0e6) for attack in ATTACKS),
+    ],
+)
 def test_a_second_sender_is_named(attack: str, degc: float, supply: float) -> None:
     theirs = second(*ATTACKS[attack], degc, supply)
     recording = one(mixed(theirs), BUS)
     assert any(SENDER in item for item in recording.quality.refused), recording.quality.refused
 
 
-@pytest.mark.parametrize("counter", [False, True])
-@pytest.mark.parametrize("cycle", [False, True])
-@pytest.mark.parametrize("attack", ["more than ours", "as many as ours", "a burst"])
+@pytest.mark.parametrize(
+    ("attack", "counter", "cycle"),
+    [
+        ("more than ours", True, True),
+        ("more than ours", True, False),
+        ("more than ours", False, True),
+        *((attack, False, False) for attack in ("more than ours", "as many as ours", "a burst")),
+    ],
+)
 def test_values_apart_name_it_on_a_bus_that_says_less(
     attack: str, counter: bool, cycle: bool
 ) -> None:
@@ -255,7 +272,7 @@ def noise(rng: np.random.Generator, how: str, count: int) -> NDArray[np.float64]
     return rng.uniform(-3.0, 3.0, count) + rng.normal(0.0, 0.5, count)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("how", ["uniform", "normal"])
 @pytest.mark.parametrize("path", ["80 degC", "-20 to 80 degC in 140 s", "a step of 20 K"])
 def test_noise_about_one_value_that_moves_is_no_second_sender(
@@ -272,7 +289,7 @@ def test_noise_about_one_value_that_moves_is_no_second_sender(
     assert told_conflicts(list(zip(oil.tolist(), supply.tolist(), strict=True))) == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("how", ["uniform", "normal"])
 @pytest.mark.parametrize(("other", "drift"), [(8.0, 0.0), (-25.0, 0.0), (25.0, 0.7)])
 @pytest.mark.parametrize("share", [0.5, 0.25])
@@ -286,7 +303,7 @@ def test_two_senders_farther_apart_than_their_noise_are_seen(
     assert conflicts > (0.5 if share == 0.5 else 0.3) * count
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_two_senders_within_their_noise_say_nothing(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 400
     oil = 40.0 + 3.0 * (np.arange(count) % 2) + noise(rng, "normal", count)
