@@ -183,16 +183,14 @@ def find_culprit(
     values = identification.values
     x = np.array([values.get(item.name, 0.0) for item in free])
     base = model.residuals(x[None, :])[0][0]
-    suspects = _suspects(model, x, base, set(values))
     row, index, start, end = _worst_place(shared, base)
     signal, experiment = CULPRIT_SIGNALS[row], shared[index]
     ticks = slice(sum(item.ticks for item in shared[:index]), None)
     modelled = _modelled(model, base, row, ticks.start, experiment.ticks)
-    advice = (
-        _signal_advice(experiment, modelled)
-        or _ring_advice(shared, values)
-        or _advice(suspects, environment)
-    )
+    advice = _signal_advice(experiment, modelled)
+    # What a broken sensor shows is of no effect.
+    suspects = () if advice else _suspects(model, x, base, set(values))
+    advice = advice or _ring_advice(shared, values) or _advice(suspects, environment)
     return Culprit(
         signal=signal,
         test=experiment.test.name,
