@@ -627,6 +627,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             progress=self.progress,
             # Of other units the first starts may leave as much as of an unknown effect.
             give_up=prior.explains_sound_units,
+            soon=not prior.has_inexact_data,
             explains=prior.explains,
             require_agreement=any(item.test.closed_loop for item in experiments),
             excess_before=before,

@@ -244,6 +244,8 @@ class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     estimation."""
     give_up: bool = False
     """Whether to stop early where no effect explains the recordings."""
+    soon: bool = False
+    """Whether hopeless starts end sooner: tried on units whose data are not in doubt."""
     excess_before: float = np.inf
     """Excess without any of the effects."""
     explains: ExplanationTest = is_noise
@@ -305,8 +307,7 @@ def _search_recordings(
         origins = [density_about(model, first, hint), *origins[::-1]]
     guide: Derivatives | None = None
     has_oil = any(item.constants.OIL > 0.0 for item in experiments)
-    # Of oil the phase of the ring may be wrong; of calibrated units no start was looked at.
-    soon = settings.give_up and joint is None and not has_oil
+    soon = settings.soon and not has_oil  # of oil the phase of the ring may be wrong
     restart_root = RESTARTS.spread_share * first.root
     if before is not None:
         there = density_of_all_recordings(before.model, before.found.density, model)
