@@ -173,24 +173,26 @@ def calibrated_explanation_test(fit: FitQuality) -> ExplanationTest:
     )
 
 
-def is_unexplainable(residuals: Array, starts: int, *, astray: bool = False) -> bool:
+def is_unexplainable(
+    residuals: Array, starts: int, *, astray: bool = False, soon: bool = False
+) -> bool:
     """Whether so much is left after so many starts that further ones will not explain it.
 
-    astray: whether a search may well end away from the optimum.
+    astray: whether a search may well end away from the optimum; soon: whether the spool shows that.
     """
     most = GIVE_UP.outliers_closed_loop if astray else GIVE_UP.outliers
     outliers = residual_outlier_share(residuals)
     if outliers > most[min(starts, len(most)) - 1]:
         return True
-    if starts < 2:
+    if starts < 2 and not (astray and soon):
         return False
     spool, *others = signal_excess_costs(residuals)
     pressure = max(others, default=0.0)
     if not astray:
         return max(spool, pressure) > GIVE_UP.excess
-    if pressure > max(spool, GIVE_UP.excess):
-        return outliers > GIVE_UP.pressure_outliers
-    return spool > (
+    if pressure > max(spool, GIVE_UP.excess) and (starts > 1 or spool <= GIVE_UP.excess):
+        return outliers > GIVE_UP.pressure_outliers[min(starts, 2) - 1]
+    return starts > 1 and spool > (
         GIVE_UP.excess if 0.0 < pressure <= FIT.max_explained_excess else GIVE_UP.spool_excess
     )
 

@@ -437,7 +437,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if not found.explained and any(item.origin_read for item in experiments):
             found = self._from_origin(experiments, found, hint, before)
         creeps = not found.explained and any(item.creeps for item in experiments)
-        if creeps and _is_near(found.refined.residuals):
+        if creeps and (calibrated or not found.confirmed) and _is_near(found.refined.residuals):
             # What creeps leads a search, though it may end it in a wrong place.
             with_creep = self._with(experiments, self.prior, hint, before, leave_creep_out=False)
             found = _better_of(found, with_creep)
@@ -627,6 +627,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             progress=self.progress,
             # Of other units the first starts may leave as much as of an unknown effect.
             give_up=prior.explains_sound_units,
+            soon=not prior.has_inexact_data,
             explains=prior.explains,
             require_agreement=any(item.test.closed_loop for item in experiments),
             excess_before=before,

@@ -64,6 +64,9 @@ class RestartRules(msgspec.Struct, frozen=True):
     closed_loop_budgets: int = 3
     """Budgets of a search in closed loop without open loop, 1: ten of 300 units were given up with
     one, one with two, none with three."""
+    coarse: float = 4.0
+    """Objective over the number of samples beyond which a start may rest sooner, 1: broken hardware
+    leaves more, and so does a start of a sound unit that went astray, which others follow."""
     relaxed_noise: float = 100.0
     """Weight of the spool over the pressure while the spool is explained first, 1."""
 
@@ -119,6 +122,7 @@ def multistart_search(
     require_agreement: bool = False,
     confirms: bool = False,
     excess_before: float = np.inf,
+    coarse: float = np.inf,
 ) -> MultistartResult:
     """Search from several starts until the residuals are explained, or the budget is spent.
 
@@ -135,7 +139,8 @@ def multistart_search(
     the last origin, until enough have ended at the same point; else every other start is near the
     best end so far; confirms: whether an end that misses only the pressure ends the search, too,
     where a second start agrees or the excess is that of `excess_before`; excess_before: excess of
-    another search with fewer unknowns. Returns best end, and those of all starts.
+    another search with fewer unknowns; coarse: see `SearchSchedule`. Returns best end, and those of
+    all starts.
     """
     until = model.evaluations + budget
     restart_root = RESTARTS.spread_share * prior.root if restart_root is None else restart_root
@@ -150,7 +155,7 @@ def multistart_search(
     while best is None or (not best.explained and model.evaluations < until):
         turn, from_best = divmod(len(places), 2)
         slow = best is not None and (require_agreement or (from_best and slow_restarts))
-        schedule = SLOW_SCHEDULE if slow else MANY_UNKNOWNS_SCHEDULE
+        schedule = replace(SLOW_SCHEDULE if slow else MANY_UNKNOWNS_SCHEDULE, coarse=coarse)
         if require_agreement:
             begin = origins[0 if best is None else -1]
         elif best is None or not from_best:
@@ -217,9 +222,6 @@ def _best_along_alias(model: Derivatives, best: MultistartResult, alias: str) ->
     return points[int(np.argmin(cauchy_cost(model.many(points))))]
 
 
-GiveUpTest = Callable[[Array, int], bool]
-
-
 class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     """Parameters that are estimated, their priors, and end of the search."""
 
@@ -242,6 +244,8 @@ class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     estimation."""
     give_up: bool = False
     """Whether to stop early where no effect explains the recordings."""
+    soon: bool = False
+    """Whether hopeless starts end sooner: tried on units whose data are not in doubt."""
     excess_before: float = np.inf
     """Excess without any of the effects."""
     explains: ExplanationTest = is_noise
@@ -302,13 +306,15 @@ def _search_recordings(
     if hint is not None:
         origins = [density_about(model, first, hint), *origins[::-1]]
     guide: Derivatives | None = None
+    has_oil = any(item.constants.OIL > 0.0 for item in experiments)
+    soon = settings.soon and not has_oil  # of oil the phase of the ring may be wrong
     restart_root = RESTARTS.spread_share * first.root
     if before is not None:
         there = density_of_all_recordings(before.model, before.found.density, model)
         origins, restart_root = [there], RESTARTS.closed_loop_share * there.root
         if hint is not None and not settings.hint_of_open:
             origins = [ParameterDensity(density_about(model, first, hint).x, restart_root), there]
-    elif any(item.constants.OIL > 0.0 for item in experiments):
+    elif has_oil:
         guide = _spool_guide(experiments, settings.free, coarse.levels)
         guided = multistart_search(
             guide,
@@ -337,10 +343,15 @@ def _search_recordings(
         * (RESTARTS.closed_loop_budgets if require_agreement and settings.give_up else 1),
         seed=settings.seed,
         progress=settings.progress,
-        gives_up=_give_up_test(give_up=settings.give_up, require_agreement=require_agreement),
+        gives_up=(
+            partial(is_unexplainable, astray=require_agreement, soon=soon)
+            if settings.give_up
+            else None
+        ),
         require_agreement=require_agreement,
         confirms=settings.give_up,
         excess_before=settings.excess_before,
+        coarse=RESTARTS.coarse if soon else np.inf,
     )
     runs = sum(item.evaluations for item in (guide, model) if item)
     return StagedSearchResult(model, found, coarse.levels, restart_root, runs)
@@ -360,13 +371,6 @@ def density_of_all_recordings(
     x = np.array([values[item.name] for item in whole.estimated]) / whole.scale
     widths = part.scale[part.curved] / whole.scale[whole.curved]
     return ParameterDensity(np.clip(x, whole.lower, whole.upper), widths[:, None] * found.root)
-
-
-def _give_up_test(*, give_up: bool, require_agreement: bool) -> GiveUpTest | None:
-    """Test of when further starts will not help."""
-    if not give_up:
-        return None
-    return partial(is_unexplainable, astray=True) if require_agreement else is_unexplainable
 
 
 def free_run_model(

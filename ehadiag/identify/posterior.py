@@ -85,6 +85,8 @@ class SearchSchedule(msgspec.Struct, frozen=True):
     1), so that the search ends, and at the best place seen; 0: it does not go by the objective."""
     width: float = 2.0
     """Width of the density, in deviations of the linear problem."""
+    coarse: float = np.inf
+    """Objective over the number of samples beyond which `flat` grows in proportion to it, 1."""
 
 
 MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
@@ -134,7 +136,7 @@ def search_posterior(
     density and linear model at the end.
     """
     density, rounds, settled = begin, 0, False
-    history = _ObjectiveHistory(prior, information, schedule.flat)
+    history = _ObjectiveHistory(prior, information, schedule)
     while not settled and rounds < schedule.most_rounds:
         between()
         linear = linearise(model, density)
@@ -159,11 +161,13 @@ def search_posterior(
 class _ObjectiveHistory:
     """Points that a search passed, and the objective there: cost and prior.
 
-    flat: see `SearchSchedule`.
+    schedule: of the search.
     """
 
-    def __init__(self, prior: ParameterDensity, information: Array, flat: float) -> None:
-        self._prior, self._information, self._flat = prior, information, flat
+    def __init__(
+        self, prior: ParameterDensity, information: Array, schedule: SearchSchedule
+    ) -> None:
+        self._prior, self._information, self._schedule = prior, information, schedule
         self._objectives: list[float] = []
         self._unit = 1.0
         self.x = prior.x
@@ -182,9 +186,8 @@ class _ObjectiveHistory:
     def is_flat(self) -> bool:
         """Whether the last rounds had the same objective several times."""
         late = sorted(self._objectives[-STALLED_ROUNDS:])[:STALLED_PLACES]
-        return len(late) == STALLED_PLACES and late[-1] - late[0] < self._flat * max(
-            self._unit, 1.0
-        )
+        flat = self._schedule.flat * max(self._unit / self._schedule.coarse, 1.0)
+        return len(late) == STALLED_PLACES and late[-1] - late[0] < flat * max(self._unit, 1.0)
 
 
 def cauchy_cost(residuals: Array) -> Array:

@@ -221,6 +221,16 @@ def sharpened(function, width=0.4, pace=MANY_UNKNOWNS_SCHEDULE, seen=None):
     return found, problem.evaluations
 
 
+@pytest.mark.parametrize(("size", "sooner"), [(60.0, True), (1.0, False)])
+def test_a_start_that_leaves_much_rests_sooner(size, sooner):
+    def function(point):
+        return curved((0.8, 0.5, 0.7))(point) + size * np.sin(np.arange(SAMPLES) / 5.0)
+
+    coarse = replace(MANY_UNKNOWNS_SCHEDULE, coarse=4.0)
+    (_, runs), (_, fewer) = sharpened(function), sharpened(function, pace=coarse)
+    assert fewer < runs if sooner else fewer == runs
+
+
 def cost_of(function, x):
     return cauchy_cost(Problem(function).many(x[None, :])[0])
 

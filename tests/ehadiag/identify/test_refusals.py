@@ -112,8 +112,12 @@ def test_hopeless_is_much_on_many_ticks_or_very_much_on_few() -> None:
     assert not is_unexplainable(bursts[[1, 1]], 3, astray=True)
     assert is_unexplainable(bursts[[1, 1]], 4, astray=True)
     assert not is_unexplainable(waves, 1, astray=True)
+    assert is_unexplainable(waves, 1, astray=True, soon=True)  # the spool is explained
     assert is_unexplainable(waves, 2, astray=True)
     assert is_unexplainable(waves[[1, 1]], 1, astray=True)
+    both = np.array([noise[0] + 3.0 * np.sin(np.arange(4000) / 200.0), waves[1]])
+    assert not is_unexplainable(both, 1, astray=True, soon=True)
+    assert is_unexplainable(both, 2, astray=True)
     spool, pressure = signal_excess_costs(noise)
     assert spool == pytest.approx(1.0, abs=0.1)
     assert pressure == pytest.approx(1.0, abs=0.1)
