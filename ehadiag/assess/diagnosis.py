@@ -34,6 +34,7 @@ from ehadiag.assess.other_causes import (
     count_other_faults,
     effects_of,
     find_culprit,
+    note_on_stand_ins,
     notes_on_effects,
     with_limits,
 )
@@ -242,12 +243,17 @@ class DiagnosisSession:
                     *_supply_objections(experiments, modelled, identification),
                     *_position_objections(positions, max_position_gain_error(self._actuator)),
                 )
-            creeping = creep_note(experiments, [item.spool for item in modelled])
-            if creeping:
-                late = (*late, creeping)
-                why = why or _objections_to_creep(identification, self._levels, creeping)
+                if why and is_explained_by_discrepancy_alone(identification.fit):
+                    block = unexplained_block(experiments, modelled)
+                    why = (*why, f"not explained to the noise either: the {block}")
+            limited = with_limits(effects_of(identification, self._actuator), self._actuator)
+            unlike = creep_note(experiments, [item.spool for item in modelled])
+            if self._actuator.calibration is not None:
+                unlike = unlike or note_on_stand_ins(limited, identification.fit)
+            if unlike:
+                late = (*late, unlike)
+                why = why or _objections_to_friction(identification, self._levels, unlike)
             if not why:
-                limited = with_limits(effects_of(identification, self._actuator), self._actuator)
                 verdict, why = count_other_faults(limited, *judge(identification, self._levels))
         effects = effects_of(identification, self._actuator)
         return Diagnosis(
@@ -372,14 +378,17 @@ def examined_recordings(
     return experiments, reasons
 
 
-def _objections_to_creep(
-    identification: Identification, levels: Levels, creeping: str
+def _objections_to_friction(
+    identification: Identification, levels: Levels, unlike: str
 ) -> tuple[str, ...]:
-    """Why a spool that creeps in steps has no verdict: unless another severity decides it."""
+    """Why a spool whose friction is unlike the law has no verdict: unless another severity decides.
+
+    unlike: how it shows.
+    """
     others = [item for item in identification.estimates if item.name != FRICTION_NAME]
     if any(chance_above(item, levels.limit) >= VERDICT.min_chance_fault for item in others):
         return ()
-    return (f"FSS is not shown: {creeping}",)
+    return (f"FSS is not shown: {unlike}",)
 
 
 def diagnose(

@@ -31,7 +31,7 @@ from ehadiag.identify.experiment import (
     share_offsets,
     unknowns_of,
 )
-from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.identification_result import Fit, Identification
 from ehadiag.identify.prior import UnitPrior, unit_prior, usual_prior
 from ehadiag.identify.ring import find_ring
 from ehadiag.model.parameter import Parameter, ParameterKind, scaled_to_channels
@@ -39,6 +39,9 @@ from ehadiag.model.plant import REFERENCE_TEMPERATURE, relative_viscosity
 from ehadiag.model.registry import REGISTRY, parameter
 from ehadiag.model.residual_models import SimdModel
 from firmware_iface.recording import Environment
+
+PLAYS = ("hysteresis", "backlash")
+"""Effects that a spool's friction may pass for."""
 
 
 def effects_of(identification: Identification | None, actuator: Actuator) -> tuple[Effect, ...]:
@@ -132,6 +135,24 @@ def notes_on_effects(effects: Sequence[Effect]) -> tuple[str, ...]:
         if item.chance is not None
         and VERDICT.min_chance_for_note < item.chance < VERDICT.min_chance_beyond_limit
     )
+
+
+def note_on_stand_ins(effects: Sequence[Effect], fit: Fit) -> str:
+    """Whether a play of a calibrated unit stands for spool friction of another law; else empty.
+
+    It is beyond its limit, while more than noise is left. A torque motor's gain was beyond its own
+    with severities that held; hysteresis with them was within 0.2 % of what was learned.
+    """
+    if not is_explained_by_discrepancy_alone(fit):
+        return ""
+    for item in effects:
+        chance = chance_beyond(item.value or 0.0, item.std or 0.0, item.limit or 0.0)
+        if item.name in PLAYS and chance >= VERDICT.min_chance_beyond_limit:
+            return (
+                f"{_size(item)} would be beyond {_limit(item)}, while more than noise is left:"
+                " friction of another law passes for it"
+            )
+    return ""
 
 
 def _size(item: Effect) -> str:

@@ -339,11 +339,11 @@ def objections_to_supply(
     for side in (1.0, -1.0):
         got, expected = side * measured[seen], side * modelled.pressure[seen]
         top = float(got.max())
-        margin = max(
-            RESPONSE.min_pressure_excess_stds * experiment.pressure_noise,
-            RESPONSE.min_pressure_excess_share * abs(top),
-        )
-        if np.count_nonzero(expected > top + margin) > RESPONSE.max_pressure_excess_ticks:
+        flat = RESPONSE.min_pressure_excess_stds * experiment.pressure_noise
+        margin = max(flat, RESPONSE.min_pressure_excess_share * abs(top))
+        # A peak that is only lower than the model's is none that is cut off.
+        cut = (expected > top + margin) & (got > top - flat)
+        if np.count_nonzero(cut) > RESPONSE.max_pressure_excess_ticks:
             return [
                 f"the pressure stops at {side * top * 1e-6:.2f} MPa where the model goes on to "
                 f"{side * float(expected.max()) * 1e-6:.2f} MPa: supply lower than its probe says,"

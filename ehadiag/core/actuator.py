@@ -132,8 +132,9 @@ ActuatorName = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
 
 ExponentOrRange = float | tuple[float, float]
 MAX_CLOGGING_EXPONENT = 2.0
-"""Largest exponent of the pressure gain behind a clogged filter, 1: that of a turbulent filter in
-series with a bridge of constant opening; a laminar one has 1, one behind the bridge's supply 0."""
+"""Largest exponent of the pressure gain behind a clogged filter, 1: that of a filter, turbulent or
+laminar, in series with a bridge of turbulent orifices, whose flow is as the root of its pressure;
+one behind the bridge's supply has 0."""
 
 
 class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
