@@ -177,6 +177,13 @@ class SpoolLaw(NamedTuple):
     """Of flapper and spool, m."""
     backlash: float
     """Half-width of the play between spool and feedback wire, m."""
+    by_bend: float
+    """Reciprocal of the deflection from `dry` to the flapper's stop, 1/m; 0 without a bridge."""
+    bend_linear: float
+    bend_square: float
+    bend_cube: float
+    """What a bridge adds to the deflection that moves the spool, m, by powers of its share of that
+    (PHY-43)."""
     ring_damping: float
     ring_rate: float
     """Decay and angular frequency (1/s) of the flapper at a resting spool; rate 0 where it does
@@ -187,9 +194,8 @@ class SpoolLaw(NamedTuple):
 def spool_law(c: PlantConstants) -> SpoolLaw:
     """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14, PHY-43).
 
-    The speed by a bridge's deflection bends little: while the flapper is free a line takes its
-    place, through the deflection that balances the friction and by least squares up to the
-    flapper's stop.
+    The speed by a bridge's deflection bends little: a line through the deflection that balances the
+    friction, by least squares up to the flapper's stop, and what it leaves as a cubic polynomial.
     """
     force = c.AS * c.GPF
     ring_damping = 0.5 * c.CF / c.JF
@@ -198,6 +204,7 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
     dry = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS / force
     dynamic = eased = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS
     damping = c.GPF / c.GQF * c.AS * c.AS + c.CS
+    by_bend = linear = square_bend = cube = 0.0
     if c.BRG > 0.0:
         gap = c.XFM / c.BRG
         part = min(c.GPF * gap / c.PSR, 1.0)
@@ -213,6 +220,19 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
             damping = force * (c.XFM - dry) / (unit * (0.5 * speed + half)) + c.CS
             clamped = force * c.XFM / (force * c.XFM / (unit * speed) + c.CS)
             eased = force * c.XFM - damping * clamped
+            quarter = bridge_speed(
+                part, SPOOL_DYNAMIC_FRICTION_SHARE * load, 0.75 * dry / gap + 0.25 * c.BRG
+            )
+            span = c.XFM - dry
+            at_quarter = span * (damping / (force * span * 0.25 / (unit * quarter) + c.CS) - 1.0)
+            at_half = span * (damping / (force * span * 0.5 / (unit * half) + c.CS) - 1.0)
+            at_stop = span * (damping / (force * span / (unit * speed) + c.CS) - 1.0)
+            # By Newton's divided differences.
+            first, second = 4.0 * (at_half - at_quarter), 2.0 * (at_stop - at_half)
+            cube = (second - first) / 0.75
+            square_bend = first - 0.75 * cube
+            linear = at_quarter - 0.25 * first + 0.125 * cube
+            by_bend = 1.0 / span
     return SpoolLaw(
         c.KSF / c.KF,
         c.KF / c.KSF,
@@ -229,9 +249,31 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.XFM,
         c.XSM,
         c.BKL,
+        by_bend,
+        linear,
+        square_bend,
+        cube,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
+
+
+@packed
+def bridge_bend(t: SpoolLaw, deflection: Any) -> Any:
+    """What a bridge adds to a deflection beyond `t.dry` along the motion, m (PHY-43)."""
+    share = maximum(minimum(deflection * t.by_bend, 1.0), 0.0)
+    return share * (t.bend_linear + share * (t.bend_square + share * t.bend_cube))
+
+
+@packed
+def with_friction(t: SpoolLaw, more: Any) -> SpoolLaw:
+    """Law of a spool that moves against more friction, as the deflection that balances it, m."""
+    return SpoolLaw(
+        t.ratio, t.reach, t.force, t.mass, t.damping, t.dynamic + t.force * more,
+        t.eased + t.force * more, t.null, t.dry + more,
+        t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash,
+        t.by_bend, t.bend_linear, t.bend_square, t.bend_cube, t.ring_damping, t.ring_rate,
+    )  # fmt: skip
 
 
 @packed
