@@ -144,6 +144,16 @@ def bridge_speed(part: float, load: float, x: float) -> float:
     return flow / half
 
 
+@inlined
+def bridge_velocity(part: float, load: float, x: float, unit: float, viscous: float) -> float:
+    """Velocity of a spool by a deflection, against viscous friction as well, m/s (PHY-43).
+
+    unit: at a `bridge_speed` of 1, m/s; viscous: load by the velocity, s/m.
+    """
+    velocity = unit * bridge_speed(part, load, x)
+    return unit * bridge_speed(part, load + viscous * velocity, x)
+
+
 class SpoolLaw(NamedTuple):
     """Torque motor, flapper and spool of one candidate."""
 
@@ -212,21 +222,18 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         breakaway = gap * bridge_stall(part, load)
         dry = gap * bridge_stall(part, SPOOL_DYNAMIC_FRICTION_SHARE * load)
         dynamic = eased = force * dry
-        speed = bridge_speed(part, SPOOL_DYNAMIC_FRICTION_SHARE * load, c.BRG)
-        if dry < c.XFM and speed > 0.0:
-            middle = 0.5 * (c.BRG + dry / gap)
-            half = bridge_speed(part, SPOOL_DYNAMIC_FRICTION_SHARE * load, middle)
-            unit = c.GQF * gap / c.AS
-            damping = force * (c.XFM - dry) / (unit * (0.5 * speed + half)) + c.CS
-            clamped = force * c.XFM / (force * c.XFM / (unit * speed) + c.CS)
-            eased = force * c.XFM - damping * clamped
-            quarter = bridge_speed(
-                part, SPOOL_DYNAMIC_FRICTION_SHARE * load, 0.75 * dry / gap + 0.25 * c.BRG
-            )
-            span = c.XFM - dry
-            at_quarter = span * (damping / (force * span * 0.25 / (unit * quarter) + c.CS) - 1.0)
-            at_half = span * (damping / (force * span * 0.5 / (unit * half) + c.CS) - 1.0)
-            at_stop = span * (damping / (force * span / (unit * speed) + c.CS) - 1.0)
+        load, viscous = SPOOL_DYNAMIC_FRICTION_SHARE * load, c.CS / (force * gap)
+        unit, span = c.GQF * gap / c.AS, c.XFM - dry
+        speed = bridge_velocity(part, load, c.BRG, unit, viscous)
+        if span > 0.0 and speed > 0.0:
+            quarter, half = dry / gap + 0.25 * span / gap, dry / gap + 0.5 * span / gap
+            at_quarter = bridge_velocity(part, load, quarter, unit, viscous)
+            at_half = bridge_velocity(part, load, half, unit, viscous)
+            damping = force * span / (0.5 * speed + at_half)
+            eased = force * c.XFM - damping * speed
+            at_quarter = at_quarter * damping / (0.25 * force) - span
+            at_half = at_half * damping / (0.5 * force) - span
+            at_stop = speed * damping / force - span
             # By Newton's divided differences.
             first, second = 4.0 * (at_half - at_quarter), 2.0 * (at_stop - at_half)
             cube = (second - first) / 0.75
