@@ -215,6 +215,7 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
     dynamic = eased = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS
     damping = c.GPF / c.GQF * c.AS * c.AS + c.CS
     by_bend = linear = square_bend = cube = 0.0
+    extra = (1.0 - SPOOL_DYNAMIC_FRICTION_SHARE) * c.FSS / force
     if c.BRG > 0.0:
         gap = c.XFM / c.BRG
         part = min(c.GPF * gap / c.PSR, 1.0)
@@ -240,6 +241,9 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
             square_bend = first - 0.75 * cube
             linear = at_quarter - 0.25 * first + 0.125 * cube
             by_bend = 1.0 / span
+        # A spool that creeps to rest stays within its static friction.
+        share = min((breakaway - dry) * by_bend, 1.0)
+        extra = breakaway - dry + share * (linear + share * (square_bend + share * cube))
     return SpoolLaw(
         c.KSF / c.KF,
         c.KF / c.KSF,
@@ -251,7 +255,7 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.XFN,
         dry,
         breakaway,
-        (1.0 - SPOOL_DYNAMIC_FRICTION_SHARE) * c.FSS / force if c.VSS > 0.0 else 0.0,
+        extra if c.VSS > 0.0 else 0.0,
         1.0 / max(c.VSS, MIN_STRIBECK_VELOCITY) if c.VSS > 0.0 else 0.0,
         c.XFM,
         c.XSM,

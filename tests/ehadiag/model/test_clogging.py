@@ -166,3 +166,13 @@ def test_the_speed_by_a_bridges_deflection_is_that_of_its_orifices(k, friction, 
     load = (SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS + c.CS * velocity) / (t.force * gap)
     expected = c.GQF * gap / c.AS * bridge_of(k, (t.dry + beyond) / gap, load)
     assert velocity == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+@given(k=st.floats(0.3, 1.0), friction=st.floats(0.0, 0.3), velocity=st.floats(1e-4, 1e-2))
+def test_a_spool_that_creeps_to_rest_stays_within_its_static_friction(k, friction, velocity):
+    """Else it would break away in every finest step: minutes for one response."""
+    c = plant_constants(with_exponent(2.0))
+    c = c._replace(GQF=c.GQF * k, GPF=c.GPF * k * k, FSS=friction * 300.0 * k * k, VSS=velocity)
+    t = spool_law(c)
+    beyond = t.breakaway - t.dry
+    assert beyond + bridge_bend(t, beyond) == pytest.approx(t.extra, rel=1e-9, abs=1e-20)
