@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import msgspec
@@ -25,7 +24,7 @@ from ehadiag.identify.signals import (
 )
 from ehadiag.model.batch import NO_ANCHOR, POSITION_ROW, Anchor, Batch
 from ehadiag.model.parameter import Parameter, scaled_to_channels
-from ehadiag.model.plant import PlantConstants, relative_viscosity
+from ehadiag.model.plant import SLIP_TICKS, PlantConstants, relative_viscosity, slip_speed
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, unit_constants
 from firmware_iface.recording import (
     CHANNELS,
@@ -64,15 +63,9 @@ class RestRules(msgspec.Struct, frozen=True):
     0.025 and 0.05 one or two of six frictions that were 6 to 31 deviations off stay so."""
     motionless_ticks: int = 10
     """Ticks in which the jack has not yet left its middle, 1."""
-    slow_ticks: int = 25
-    """Ticks, 1, over which the jack's mean position is taken before and after one to see whether
-    it slides: two periods of a ring at 80 Hz."""
     slow_noise_lsb: float = 4.0
     """Range of a jack's position by the noise of half a step of the converter, LSB: four
     deviations to either side."""
-    slow_ratio: float = 1.5
-    """Speed below which a jack slips in steps, over friction / (mass, ring), 1: of four units
-    of other components three rang on at 1.1, 0.9 and 0.6 of it, one did not at 2."""
     min_held_ticks: int = 100
     """Least number of ticks of a hold, 1: a null bias lets the spool settle for 71 (a unit of
     `test_few_effects` with data 5 % off); a pressure that rings on its oil at 80 Hz turns within
@@ -147,22 +140,11 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         return replace(self, constants=self.constants._replace(CLE=exponent, BRG=bridge))
 
     def slip_speed(self, severity: float = 0.0) -> float:
-        """Speed, m/s, below which a jack of a severity of `FDJ` slips in steps and rings on.
-
-        Without oil in the second stage nothing rings: 0.
-        """
-        c = self.constants
-        if c.OIL == 0.0:
-            return 0.0
-        friction = c.FDJ + severity * (c.FDJ1 - c.FDJ)
-        return float(REST.slow_ratio * friction / (c.AJ * math.sqrt(c.OIL * c.MJ)))
+        """Return the speed, m/s, below which a jack of a severity of `FDJ` slips in steps."""
+        return slip_speed(self.constants, severity)
 
     def sliding(self, slip_speed: float) -> Experiment:
-        """Return the same without the pressure on a jack that stands or slides more slowly.
-
-        Friction holds any pressure of its band on a standing jack: which one is decided by 0.1 µm
-        of the spool. A slow one slips in steps, and rings on: the phase is decided by as little.
-        """
+        """Return the same without the pressure on a jack that stands or slides more slowly."""
         if slip_speed == 0.0:
             return self
         slow = slow_ticks(self.position, self.channels.position, slip_speed * self.tick)
@@ -294,7 +276,7 @@ def build_experiment(
 
 def slow_ticks(position: Array, channel: Channel, least: float) -> NDArray[np.bool_]:
     """Ticks, shape (n,), around which the jack moves by less than `least`, m, a tick."""
-    count = REST.slow_ticks
+    count = SLIP_TICKS
     seen = np.isfinite(position)
     if not seen.any():
         return np.zeros(len(position), dtype=np.bool_)

@@ -144,6 +144,16 @@ def bridge_speed(part: float, load: float, x: float) -> float:
     return flow / half
 
 
+@inlined
+def bridge_velocity(part: float, load: float, x: float, unit: float, viscous: float) -> float:
+    """Velocity of a spool by a deflection, against viscous friction as well, m/s (PHY-43).
+
+    unit: at a `bridge_speed` of 1, m/s; viscous: load by the velocity, s/m.
+    """
+    velocity = unit * bridge_speed(part, load, x)
+    return unit * bridge_speed(part, load + viscous * velocity, x)
+
+
 class SpoolLaw(NamedTuple):
     """Torque motor, flapper and spool of one candidate."""
 
@@ -177,6 +187,13 @@ class SpoolLaw(NamedTuple):
     """Of flapper and spool, m."""
     backlash: float
     """Half-width of the play between spool and feedback wire, m."""
+    by_bend: float
+    """Reciprocal of the deflection from `dry` to the flapper's stop, 1/m; 0 without a bridge."""
+    bend_linear: float
+    bend_square: float
+    bend_cube: float
+    """What a bridge adds to the deflection that moves the spool, m, by powers of its share of that
+    (PHY-43)."""
     ring_damping: float
     ring_rate: float
     """Decay and angular frequency (1/s) of the flapper at a resting spool; rate 0 where it does
@@ -187,9 +204,8 @@ class SpoolLaw(NamedTuple):
 def spool_law(c: PlantConstants) -> SpoolLaw:
     """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14, PHY-43).
 
-    The speed by a bridge's deflection bends little: while the flapper is free a line takes its
-    place, through the deflection that balances the friction and by least squares up to the
-    flapper's stop.
+    The speed by a bridge's deflection bends little: a line through the deflection that balances the
+    friction, by least squares up to the flapper's stop, and what it leaves as a cubic polynomial.
     """
     force = c.AS * c.GPF
     ring_damping = 0.5 * c.CF / c.JF
@@ -198,6 +214,8 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
     dry = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS / force
     dynamic = eased = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS
     damping = c.GPF / c.GQF * c.AS * c.AS + c.CS
+    by_bend = linear = square_bend = cube = 0.0
+    extra = (1.0 - SPOOL_DYNAMIC_FRICTION_SHARE) * c.FSS / force
     if c.BRG > 0.0:
         gap = c.XFM / c.BRG
         part = min(c.GPF * gap / c.PSR, 1.0)
@@ -205,14 +223,27 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         breakaway = gap * bridge_stall(part, load)
         dry = gap * bridge_stall(part, SPOOL_DYNAMIC_FRICTION_SHARE * load)
         dynamic = eased = force * dry
-        speed = bridge_speed(part, SPOOL_DYNAMIC_FRICTION_SHARE * load, c.BRG)
-        if dry < c.XFM and speed > 0.0:
-            middle = 0.5 * (c.BRG + dry / gap)
-            half = bridge_speed(part, SPOOL_DYNAMIC_FRICTION_SHARE * load, middle)
-            unit = c.GQF * gap / c.AS
-            damping = force * (c.XFM - dry) / (unit * (0.5 * speed + half)) + c.CS
-            clamped = force * c.XFM / (force * c.XFM / (unit * speed) + c.CS)
-            eased = force * c.XFM - damping * clamped
+        load, viscous = SPOOL_DYNAMIC_FRICTION_SHARE * load, c.CS / (force * gap)
+        unit, span = c.GQF * gap / c.AS, c.XFM - dry
+        speed = bridge_velocity(part, load, c.BRG, unit, viscous)
+        if span > 0.0 and speed > 0.0:
+            quarter, half = dry / gap + 0.25 * span / gap, dry / gap + 0.5 * span / gap
+            at_quarter = bridge_velocity(part, load, quarter, unit, viscous)
+            at_half = bridge_velocity(part, load, half, unit, viscous)
+            damping = force * span / (0.5 * speed + at_half)
+            eased = force * c.XFM - damping * speed
+            at_quarter = at_quarter * damping / (0.25 * force) - span
+            at_half = at_half * damping / (0.5 * force) - span
+            at_stop = speed * damping / force - span
+            # By Newton's divided differences.
+            first, second = 4.0 * (at_half - at_quarter), 2.0 * (at_stop - at_half)
+            cube = (second - first) / 0.75
+            square_bend = first - 0.75 * cube
+            linear = at_quarter - 0.25 * first + 0.125 * cube
+            by_bend = 1.0 / span
+        # A spool that creeps to rest stays within its static friction.
+        share = min((breakaway - dry) * by_bend, 1.0)
+        extra = breakaway - dry + share * (linear + share * (square_bend + share * cube))
     return SpoolLaw(
         c.KSF / c.KF,
         c.KF / c.KSF,
@@ -224,14 +255,36 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.XFN,
         dry,
         breakaway,
-        (1.0 - SPOOL_DYNAMIC_FRICTION_SHARE) * c.FSS / force if c.VSS > 0.0 else 0.0,
+        extra if c.VSS > 0.0 else 0.0,
         1.0 / max(c.VSS, MIN_STRIBECK_VELOCITY) if c.VSS > 0.0 else 0.0,
         c.XFM,
         c.XSM,
         c.BKL,
+        by_bend,
+        linear,
+        square_bend,
+        cube,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
+
+
+@packed
+def bridge_bend(t: SpoolLaw, deflection: Any) -> Any:
+    """What a bridge adds to a deflection beyond `t.dry` along the motion, m (PHY-43)."""
+    share = maximum(minimum(deflection * t.by_bend, 1.0), 0.0)
+    return share * (t.bend_linear + share * (t.bend_square + share * t.bend_cube))
+
+
+@packed
+def with_friction(t: SpoolLaw, more: Any) -> SpoolLaw:
+    """Law of a spool that moves against more friction, as the deflection that balances it, m."""
+    return SpoolLaw(
+        t.ratio, t.reach, t.force, t.mass, t.damping, t.dynamic + t.force * more,
+        t.eased + t.force * more, t.null, t.dry + more,
+        t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash,
+        t.by_bend, t.bend_linear, t.bend_square, t.bend_cube, t.ring_damping, t.ring_rate,
+    )  # fmt: skip
 
 
 @packed

@@ -183,6 +183,27 @@ def bridge_stop(valve: Servovalve) -> float:
     return valve.GPF * valve.XFM / valve.PSR
 
 
+SLIP_SPEED_RATIO = 1.5
+"""Speed below which a jack slips in steps, over friction / (mass, ring), 1: of four units of other
+components three rang on at 1.1, 0.9 and 0.6 of it, one did not at 2."""
+SLIP_TICKS = 25
+"""Ticks, 1, over which the jack's travel shows whether it slides: two periods of a ring at 80
+Hz."""
+
+
+def slip_speed(c: PlantConstants, severity: float = 0.0) -> float:
+    """Speed, m/s, below which a jack of a severity of `FDJ` slips in steps and rings on.
+
+    Friction holds any pressure of its band on a standing jack: which one is decided by 0.1 µm of
+    the spool. A slow one slips in steps, and rings on: the phase is decided by as little. Without
+    oil in the second stage nothing rings: 0.
+    """
+    if c.OIL == 0.0:
+        return 0.0
+    friction = c.FDJ + severity * (c.FDJ1 - c.FDJ)
+    return float(SLIP_SPEED_RATIO * friction / (c.AJ * math.sqrt(c.OIL * c.MJ)))
+
+
 def plant_constants(actuator: Actuator, environment: Environment | None = None) -> PlantConstants:
     """Constants of the unit as new, at the oil temperature and supply that the bus reports.
 

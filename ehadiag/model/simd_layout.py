@@ -391,6 +391,8 @@ class BlockTraits(NamedTuple):
     """A sensor with dynamics."""
     orifice: bool
     """Orifices in its second stage."""
+    bridge: bool
+    """A bridge of orifices in its first stage."""
     plays: int
     """Number of plays of the hysteresis."""
 
@@ -405,6 +407,7 @@ def lane_traits(coefficients: Array, i: int, plays: int) -> BlockTraits:
         jack.shaped != 0.0,
         has_sensor_dynamics(sensor_law_of_lane(coefficients, i)) or jack.by_stribeck > 0.0,
         jack.oil > 0.0,
+        spool.by_bend > 0.0,
         plays,
     )
 
@@ -431,7 +434,7 @@ def tabulate_coefficients(address: int, candidates: Array, tick: float) -> Block
     rates[:] = 0.0
     ring[:] = 0.0
     plays = int(plant_of(candidates[0]).NPL)
-    any_of = BlockTraits(False, False, False, False, False, plays)
+    any_of = BlockTraits(False, False, False, False, False, False, plays)
     for i in range(LANES):
         c = plant_of(candidates[i])
         t = _laws(c, tick, i, coefficients)
@@ -440,7 +443,7 @@ def tabulate_coefficients(address: int, candidates: Array, tick: float) -> Block
         any_of = BlockTraits(
             any_of.backlash or has.backlash, any_of.creeps or has.creeps,
             any_of.shaped or has.shaped, any_of.senses or has.senses,
-            any_of.orifice or has.orifice, plays,
+            any_of.orifice or has.orifice, any_of.bridge or has.bridge, plays,
         )  # fmt: skip
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0

@@ -124,7 +124,7 @@ def _block(
     # Lanes that hold no candidate repeat the last one up to its first event; a half of none is left
     # out.
     end = VECTOR_WIDTH if count <= VECTOR_WIDTH else LANES
-    has = BlockTraits(False, False, False, False, False, 0)
+    has = BlockTraits(False, False, False, False, False, False, 0)
     sums[:] = 0.0
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):

@@ -27,6 +27,7 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.laws import (
     SpoolLaw,
+    bridge_bend,
     clamped_spool_velocity,
     flapper_rest,
     lagged_current,
@@ -34,6 +35,7 @@ from ehadiag.model.laws import (
     play_output,
     spool_rest_position,
     steady_spool_velocity,
+    with_friction,
 )
 from ehadiag.model.sensors import cubic_through_ends, filter_output, read_spool
 from ehadiag.model.simd_layout import (
@@ -45,6 +47,7 @@ from ehadiag.model.simd_layout import (
     MOVING_ROWS,
     ROWS,
     STEPS,
+    BlockTraits,
     drive_laws,
     full_filter_steps,
     sampled_filter_steps,
@@ -163,6 +166,21 @@ def _quarter_step(
 
 
 @packed
+def _bent_quarter_step(
+    bends: bool, t: SpoolLaw, m: tuple[Vector, ...], a: Vector, w: Vector, b: Vector, v: Vector,
+    bow: float, slowest: Vector, lowest: Vector, widest: Vector,
+) -> tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector]:  # fmt: skip
+    """As `_quarter_step`, by the bridge's bend in the middle of the step where any lane has one."""
+    if not bends:
+        return _quarter_step(m, a, w, b, v, bow, t.dry, slowest, lowest, widest)
+    bend = bridge_bend(t, a + 2.0 * bow * w)
+    na, nw, nb, nv, slowest, lowest, widest = _quarter_step(
+        m, a + bend, w, b - t.reach * bend, v, bow, t.dry - bend, slowest, lowest, widest
+    )
+    return na - bend, nw, nb + t.reach * bend, nv, slowest, lowest, widest
+
+
+@packed
 def _loose_quarter_step(
     m: tuple[Vector, ...], a: Vector, w: Vector, b: Vector, v: Vector, bow: float,
     lift: Vector, dry: Vector, slowest: Vector, lowest: Vector, widest: Vector, steady: Vector,
@@ -179,14 +197,14 @@ def _loose_quarter_step(
 
 @packed
 def spool_lanes(
-    end: int, tick: float, backlash: bool, state: Array, path: Array, coefficients: Array
+    end: int, tick: float, has: BlockTraits, state: Array, path: Array, coefficients: Array
 ) -> bool:
-    """Flapper and spool of all lanes over a tick without events; backlash: of any lane.
+    """Flapper and spool of all lanes over a tick without events; has: what any lane has.
 
     Lanes in which an event may hide are marked busy and left as they were; returns whether there
     are any.
     """
-    any_busy = False
+    any_busy, backlash, bends = False, has.backlash, has.bridge
     bow = tick / 16.0
     for o in range(0, end, VECTOR_WIDTH):
         xf, wf = load(state, ROWS.flapper * LANES + o), load(state, ROWS.flapper_rate * LANES + o)
@@ -219,13 +237,13 @@ def spool_lanes(
             base = spool_rest_position(t, deflection, d)
             a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
             s, n, x = zero + SPOOL_LIMITS.no_event, zero + SPOOL_LIMITS.no_event, zero
-            a, w, b, v, s, n, x = _quarter_step(m, a, w, b, v, bow, dry, s, n, x)
+            a, w, b, v, s, n, x = _bent_quarter_step(bends, t, m, a, w, b, v, bow, s, n, x)
             b1, u1 = base + d * b, d * v
-            a, w, b, v, s, n, x = _quarter_step(m, a, w, b, v, bow, dry, s, n, x)
+            a, w, b, v, s, n, x = _bent_quarter_step(bends, t, m, a, w, b, v, bow, s, n, x)
             b2, u2 = base + d * b, d * v
-            a, w, b, v, s, n, x = _quarter_step(m, a, w, b, v, bow, dry, s, n, x)
+            a, w, b, v, s, n, x = _bent_quarter_step(bends, t, m, a, w, b, v, bow, s, n, x)
             b3, u3 = base + d * b, d * v
-            a, w, b, v, s, n, x = _quarter_step(m, a, w, b, v, bow, dry, s, n, x)
+            a, w, b, v, s, n, x = _bent_quarter_step(bends, t, m, a, w, b, v, bow, s, n, x)
             b4, u4 = base + d * b, d * maximum(v, SPOOL_LIMITS.velocity)
             loose = d * (xs - wire) < t.backlash - WIRE_TOLERANCE
             # A spool whose friction falls with its velocity: `creep_lanes`.
@@ -256,7 +274,10 @@ def spool_lanes(
                 )  # fmt: skip
                 # All positive along the motion; the flapper rings about `still`.
                 lift, step = still * d, 0.25 * tick
-                steady = (t.force * lift - t.dynamic) / t.damping
+                driving = lift
+                if bends:
+                    driving = lift + bridge_bend(t, lift - dry)
+                steady = (t.force * driving - t.dynamic) / t.damping
                 a, w, b, v = xf * d - lift, wf * d, zero, vs * d - steady
                 s, n, x = zero + SPOOL_LIMITS.no_event, zero + SPOOL_LIMITS.no_event, zero
                 a, w, b, v, s, n, x = _loose_quarter_step(
@@ -390,10 +411,13 @@ def _creep_quarter_step(
 
     a, b: from where flapper and spool would rest by the dynamic friction alone.
     """
+    bend = bridge_bend(t, a + 0.5 * span * w)
+    a, b = a + bend, b - t.reach * bend
     free = m[12] * a + m[13] * w + m[14] * b + m[15] * v
     swing = m[4] * a + m[5] * w + m[6] * b + m[7] * v - w
     mean, largest, less, miss = creep_friction(t, span, v, free, m[12] - m[14] * t.reach, swing)
     a, b = a - mean, b + t.reach * mean
+    mean = mean - bend
     na = m[0] * a + m[1] * w + m[2] * b + m[3] * v + mean
     nw = m[4] * a + m[5] * w + m[6] * b + m[7] * v
     nb = m[8] * a + m[9] * w + m[10] * b + m[11] * v - t.reach * mean
@@ -519,10 +543,4 @@ def held_friction(
         swing = loose[k + 4 * STEPS] * (s.xf - still) + loose[k + 5 * STEPS] * s.wf - s.wf
         pull = t.force / t.damping * (1.0 - fade)
     mean, _, less, doubt = creep_friction(t, steps * h, s.vs * d, free * d, pull, swing * d)
-    law = SpoolLaw(
-        t.ratio, t.reach, t.force, t.mass, t.damping, t.dynamic + t.force * mean,
-        t.eased + t.force * mean, t.null, t.dry + mean,
-        t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash,
-        t.ring_damping, t.ring_rate,
-    )  # fmt: skip
-    return law, less, doubt <= MAX_CREEP_ERROR
+    return with_friction(t, mean), less, doubt <= MAX_CREEP_ERROR

@@ -29,10 +29,12 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.laws import (
     SpoolLaw,
+    bridge_bend,
     clamped_spool_velocity,
     flapper_rest,
     play_output,
     spool_rest_position,
+    with_friction,
 )
 from ehadiag.model.second_stage import jack_piece, land_opening_piece
 from ehadiag.model.sensors import PathPiece, PressureProbe, has_sensor_dynamics
@@ -54,7 +56,7 @@ from ehadiag.model.simd_layout import (
     sensor_law_of_lane,
     spool_law_of_lane,
 )
-from ehadiag.model.simd_spool import held_friction
+from ehadiag.model.simd_spool import SPOOL_LIMITS, held_friction
 from ehadiag.model.spool_events import (
     EVENTS,
     WIRE_TOLERANCE,
@@ -269,11 +271,19 @@ def _event_tick(
         whole = STEPS - ((done >> shift) & (STEPS - 1))
         h, place = unit * (1 << shift), i * len(STEP_SHIFTS) + level
         law, less, short = t, 0.0, True
-        if s.direction != 0 and t.extra > 0.0:
-            law, less, short = held_friction(t, moving, loose, place, whole, h, deflection, s)
+        if s.direction != 0 and t.by_bend > 0.0 and not s.clamped:
+            # By the bridge's bend in the middle of the steps.
+            ahead = (s.xf + 0.5 * whole * h * s.wf) * s.direction - t.dry
+            law = with_friction(t, -bridge_bend(t, ahead))
+            short = whole * h <= SPOOL_LIMITS.held_s
+        if short and s.direction != 0 and t.extra > 0.0:
+            bent = law
+            law, less, short = held_friction(bent, moving, loose, place, whole, h, deflection, s)
             if fine and not short:
                 whole = 1
-                law, less, short = held_friction(t, moving, loose, place, whole, h, deflection, s)
+                law, less, short = held_friction(
+                    bent, moving, loose, place, whole, h, deflection, s
+                )
         first, last = whole if short or fine else 0, _Instant(0.0, 0.0, 0.0)
         carries = s.direction != 0 and is_wire_carried(t, s.direction, s.xs, s.wire)
         base = spool_rest_position(law, deflection, float(s.direction))

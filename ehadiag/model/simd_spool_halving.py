@@ -31,7 +31,14 @@ from ehadiag.compile.vector import (
     store_where,
     where,
 )
-from ehadiag.model.laws import SpoolLaw, flapper_rest, play_output, spool_rest_position
+from ehadiag.model.laws import (
+    SpoolLaw,
+    bridge_bend,
+    flapper_rest,
+    play_output,
+    spool_rest_position,
+    with_friction,
+)
 from ehadiag.model.simd_jack_pieces import PIECE_NUMBERS, jack_over_pieces
 from ehadiag.model.simd_layout import (
     LANE_NODES,
@@ -42,6 +49,7 @@ from ehadiag.model.simd_layout import (
     QUARTER_UNITS,
     ROWS,
     TICK_UNITS,
+    BlockTraits,
     spool_laws,
 )
 from ehadiag.model.spool_events import WIRE_TOLERANCE
@@ -177,12 +185,12 @@ def _rung(
 @packed
 def _advanced(
     t: SpoolLaw, tables: _Tables, o: int, longest: int, shortest: int, rest: Vector, unit: float,
-    fine: bool, backlash: bool, deflection: Vector, going: Mask, s: _Motion,
+    fine: bool, has: BlockTraits, deflection: Vector, going: Mask, s: _Motion,
 ) -> tuple[_Motion, Mask, Mask]:  # fmt: skip
     """Lanes that go, after `rest` steps of `unit` seconds in one go.
 
     longest, shortest: which of their binary digits may be 1. fine: whether it is the finest step;
-    backlash: whether any lane has some.
+    has: what any lane has.
 
     Returns the state, in which of them an event has come or may hide, and in which there is a stop.
     """
@@ -191,7 +199,10 @@ def _advanced(
     found_in = going & ~going
     stops_in = found_in
     moves, rests = going & (s.d != 0.0), going & (s.d == 0.0)
-    if backlash:
+    if has.bridge:
+        # By its bend in the middle of the step; a spool at rest has none.
+        t = with_friction(t, -bridge_bend(t, (s.xf + 0.5 * h * s.wf) * s.d - t.dry))
+    if has.backlash:
         free = moves & (s.d * (s.xs - s.wire) < t.backlash - WIRE_TOLERANCE)
         moves = moves & ~free
         if any_lane(free):
@@ -242,7 +253,7 @@ def _cut(pieces: Array, count: int, span: Vector, xs: Vector, before: Vector, en
 def _halved(
     o: int,
     tick: float,
-    backlash: bool,
+    has: BlockTraits,
     with_jack: bool,
     state: Array,
     path: Array,
@@ -277,7 +288,7 @@ def _halved(
                 units, fine = float(1 << level), n > QUARTER_HALVINGS
                 wants = (hunts != 0.0) & (done + units <= limit)
                 new, found, stops = _advanced(
-                    t, tables, o, level, level, zero + units, unit, fine, backlash,
+                    t, tables, o, level, level, zero + units, unit, fine, has,
                     deflection, wants, s,
                 )  # fmt: skip
                 good, hunts = where(stops, 0.0, good), where(stops, 0.0, hunts)
@@ -317,7 +328,7 @@ def _halved(
                     rest,
                     unit,
                     False,
-                    backlash,
+                    has,
                     deflection,
                     going,
                     s,
@@ -353,7 +364,7 @@ def _halved(
 def halved_lanes(
     end: int,
     tick: float,
-    backlash: bool,
+    has: BlockTraits,
     with_jack: bool,
     state: Array,
     path: Array,
@@ -367,12 +378,12 @@ def halved_lanes(
 
     Events are located to tick / 2^`FINEST_LEVEL`. Lanes that must be computed alone stay busy and
     unchanged; returns whether there are any. with_jack: whether the jack takes the pieces of the
-    spool's path that events cut; backlash: whether any lane has some; slides, free_slides, rings:
+    spool's path that events cut; has: what any lane has; slides, free_slides, rings:
     transitions over 2^0 … 2^QUARTER_HALVINGS finest steps, see `ehadiag.model.simd_layout`.
     """
     any_busy, tables = False, _Tables(slides, free_slides, rings)
     for o in range(0, end, VECTOR_WIDTH):
-        _halved(o, tick, backlash, with_jack, state, path, coefficients, tables, pieces)
+        _halved(o, tick, has, with_jack, state, path, coefficients, tables, pieces)
         if any_lane(load(state, ROWS.busy * LANES + o) != 0.0):
             any_busy = True
     return any_busy

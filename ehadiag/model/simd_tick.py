@@ -148,12 +148,12 @@ def advance_block(
     path = block_part(address, BLOCK.path, BLOCK.coefficients)
     coefficients = block_part(address, BLOCK.coefficients, BLOCK.moving)
     drive_lanes(end, current, has.plays, state, coefficients)
-    busy = spool_lanes(end, tick, has.backlash, state, path, coefficients)
+    busy = spool_lanes(end, tick, has, state, path, coefficients)
     if busy and has.creeps:
         busy = creep_lanes(end, tick, state, path, coefficients)
     if busy:
         busy = halved_lanes(
-            end, tick, has.backlash, with_jack, state, path, coefficients,
+            end, tick, has, with_jack, state, path, coefficients,
             block_part(address, BLOCK.slides, BLOCK.free_slides),
             block_part(address, BLOCK.free_slides, BLOCK.rings),
             block_part(address, BLOCK.rings, BLOCK.pieces),

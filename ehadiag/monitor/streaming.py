@@ -8,6 +8,7 @@ pressure.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, NoReturn, TypeVar, cast
 
@@ -21,7 +22,7 @@ from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.model.batch import Anchor
 from ehadiag.model.laws import JACK_STATIC_FRICTION_RATIO
-from ehadiag.model.plant import PlantConstants, relative_viscosity
+from ehadiag.model.plant import SLIP_TICKS, PlantConstants, relative_viscosity, slip_speed
 from ehadiag.model.registry import FAULTS, REGISTRY, Unknowns, parameter, unit_constants
 from ehadiag.model.simd_layout import ROWS, aligned_numbers
 from ehadiag.monitor import monitor_memory
@@ -322,13 +323,17 @@ class FreeMotionMonitor:
 
     monitor: the monitor that it pushes into, with the unit's own severities; undecided: spool
     position either side of the middle within which the pressure is undecided, m; see
-    `undecided_spool`; offset: constant error of the spool's sensor, m.
+    `undecided_spool`; offset: constant error of the spool's sensor, m; travel: of the jack in
+    `SLIP_TICKS` ticks below which the pressure is undecided, too, m; see `undecided_travel`.
     """
 
-    def __init__(self, monitor: Monitor, undecided: float, offset: float = 0.0) -> None:
+    def __init__(
+        self, monitor: Monitor, undecided: float, offset: float = 0.0, travel: float = 0.0
+    ) -> None:
         self.monitor = monitor
         """What it pushes into."""
-        self._undecided, self._offset = undecided, offset
+        self._undecided, self._offset, self._travel = undecided, offset, travel
+        self._places: deque[float] = deque(maxlen=SLIP_TICKS + 1)
         self._resting = 0
         self._age = 0
 
@@ -349,6 +354,12 @@ class FreeMotionMonitor:
         monitor, near = self.monitor, self._undecided
         if abs(spool - self._offset) < near or abs(monitor.reading.predicted[0]) < near:
             self._resting = PAUSE_TICKS
+        if self._travel > 0.0:
+            places = self._places
+            if math.isfinite(position):
+                places.append(position)
+            if len(places) <= SLIP_TICKS or abs(places[-1] - places[0]) < self._travel:
+                self._resting = PAUSE_TICKS
         if self._resting:
             self._resting -= 1
             sample = command, current, spool, math.nan, position
@@ -367,6 +378,7 @@ class FreeMotionMonitor:
     def reset(self, spool: float = 0.0) -> None:
         """Restart from rest with the spool there (m)."""
         self._resting, self._age = PAUSE_TICKS, 0
+        self._places.clear()
         self.monitor.reset(spool)
 
 
@@ -381,3 +393,12 @@ def undecided_spool(actuator: Actuator, severity: float) -> float:
     worn = Unknowns((parameter("FDJ"),), (constants,), {}).constants(np.array([severity]))
     friction = JACK_STATIC_FRICTION_RATIO * float(worn.FDJ)
     return friction / (actuator.jack.AJ * actuator.servovalve.GP) + UNDECIDED_SPOOL_STEPS * step
+
+
+def undecided_travel(actuator: Actuator, severity: float) -> float:
+    """Travel of the jack in `SLIP_TICKS` ticks below which it slips in steps, m.
+
+    severity: FDJ. 0 without oil in the second stage.
+    """
+    slip = slip_speed(unit_constants(actuator), severity)
+    return slip * SLIP_TICKS / actuator.controller.rate

@@ -20,7 +20,7 @@ from ehadiag.live import Residuals, RunningTest, SignalTrace
 from ehadiag.monitor.change_test import LEAST, Cause, ChangeTest
 from ehadiag.monitor.plan import default_noise
 from ehadiag.monitor.score_bank import ScoreBank
-from ehadiag.monitor.streaming import FreeMotionMonitor, Monitor, undecided_spool
+from ehadiag.monitor.streaming import FreeMotionMonitor, Monitor, undecided_spool, undecided_travel
 from ehadiag.session.unit_state import UnitState
 from firmware_iface.alignment.grid import StretchTicks
 from firmware_iface.bus_map import BusMap, MessageMap
@@ -374,8 +374,12 @@ class BusMonitor:
         if waits and self.ticks < 1.0 * self._rate and self.ticks:
             return
         actuator, effects = self.unit.unit(self._actuator)
-        noise, channels = self.unit.noise, stated_channels(self._map.stated, actuator)
+        channels = stated_channels(self._map.stated, actuator)
+        calibration = actuator.calibration
+        # What the model leaves of the unit as new is none of its changes.
+        share = 1.0 if calibration is None else 1.0 + calibration.fit.left
         least = default_noise(channels)
+        measured = self.unit.noise or least
         monitor = Monitor(
             actuator,
             self.unit.faults,
@@ -383,15 +387,18 @@ class BusMonitor:
             mode=self._live.mode,
             hours=self._hours,
             # A fit may take some of the noise for its own.
-            noise=None if noise is None else (max(noise[0], least[0]), max(noise[1], least[1])),
+            noise=(share * max(measured[0], least[0]), share * max(measured[1], least[1])),
             offsets=self.unit.offsets,
             effects=effects,
             channels=channels,
         )
         self._made_for = environment
         self._threshold = monitor.design.threshold
-        undecided = undecided_spool(actuator, self.unit.faults[2])
-        made = FreeMotionMonitor(monitor, undecided, self.unit.offsets[0])
+        friction = self.unit.faults[2]
+        made = FreeMotionMonitor(
+            monitor, undecided_spool(actuator, friction), self.unit.offsets[0],
+            undecided_travel(actuator, friction),
+        )  # fmt: skip
         # Before the first tick it only checks the ranges of the numbers.
         self._monitor = made if self.ticks else None
         self._changes = None
