@@ -10,7 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.actuator import Actuator, Calibration, Discrepancy
+from ehadiag.core.actuator import Actuator, Calibration
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.identify.estimates import (
@@ -300,12 +300,6 @@ EXACT_UNIT_PRIOR = UnitPrior()
 """The data are exact."""
 
 
-LAWS_OF_BRIDGE = Discrepancy(FDJ=0.0)
-"""Least discrepancy where an exponent above 0 is stated: the kernels have a line in the bridge
-(PHY-43), by which the simulator's exact one with exponent 2 is read 1.2 % off in `Kintas` and 2.5 %
-of itself in `FSS`."""
-
-
 def unit_prior(actuator: Actuator) -> UnitPrior:
     """Prior of a unit by its actuator file; ConfigurationError: unknown calibrated parameter."""
     low, high = actuator.servovalve.clogging_range
@@ -323,12 +317,7 @@ def unit_prior(actuator: Actuator) -> UnitPrior:
         severities=severities,
         exponents=(low, high),
         bridge=bridge_stop(actuator.servovalve),
-        discrepancy={
-            name: max(
-                getattr(actuator.discrepancy, name), getattr(LAWS_OF_BRIDGE, name) * (high > 0)
-            )
-            for name in FAULT_NAMES
-        },
+        discrepancy={name: getattr(actuator.discrepancy, name) for name in FAULT_NAMES},
     )
 
 

@@ -199,24 +199,14 @@ def test_discrepancy_grows_with_wear_and_with_what_is_left():
     assert np.sqrt(np.diag(stiff)) == pytest.approx([0.008, 0.024, 0.0])
 
 
-def test_a_bridge_is_never_stated_to_be_exact():
-    """The kernels have a line in it: `FSS` was 0.5848 ± 0.0002 for 0.6, `Kintas` alike."""
-    laws = {m: unit_prior(with_exponent(m)).discrepancy for m in (0.0, 2.0, (0.0, 2.0))}
-    assert not any(laws[0.0].values())
-    assert laws[2.0] == laws[0.0, 2.0] == {"Kintas": 0.01, "FSS": 0.03, "FDJ": 0.0}
-    wide = msgspec.structs.replace(with_exponent(2.0), discrepancy=Discrepancy(FSS=0.1))
-    assert unit_prior(wide).discrepancy == {"Kintas": 0.01, "FSS": 0.1, "FDJ": 0.01}
-
-
 @pytest.mark.slow
 def test_a_series_filter_on_the_bundled_file_as_its_page_says():
-    """`ehadiag init actuator`, an exponent, the simulator: the intervals hold what was put in."""
+    """`ehadiag init actuator`, an exponent, the simulator: `FSS` was 0.5848 ± 0.0002 for 0.6."""
     put_in = {"Kintas": 0.3, "FSS": 0.6, "FDJ": 0.3}
     unit = msgspec.structs.replace(with_exponent(2.0), second_stage=SecondStage(kind="orifice"))
     found = ehadiag.diagnose(simulate("open", actuator=unit, **put_in), actuator=unit)
     for name, value in put_in.items():
-        low, high = found.faults[name].interval
-        assert low < value < high, name
+        assert found.faults[name].estimate == pytest.approx(value, abs=5e-4), name
 
 
 def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_pressure():

@@ -148,10 +148,7 @@ RANGE = library_plan(of_exponent((0.0, 2.0)), design_cusum(100.0, 1e-3))
     st.tuples(*(st.floats(0.0, 1.0),) * 3),
     st.tuples(*(st.floats(-4.0, -1.5).map(lambda power: 10.0**power),) * 3),
 )
-def test_a_range_of_exponents_does_what_it_does_in_the_package(values, raw):
-    clogging, spool, _ = values
-    laws = (0.01 * math.hypot(clogging, spool), 0.03 * spool, 0.0)
-    stds = np.hypot(raw, laws).tolist()
+def test_a_range_of_exponents_does_what_it_does_in_the_package(values, stds):
     friction = friction_range(
         dict(zip(NAMES, values, strict=True)), stds[1], plant_constants(ACTUATOR), (0.0, 2.0),
         with_exponent=2.0,
@@ -165,7 +162,7 @@ def test_a_range_of_exponents_does_what_it_does_in_the_package(values, raw):
     assume(abs(sum(above) - verdict.VERDICT.max_chance_false_healthy) > EDGE)
     assume(all(abs(chance - verdict.VERDICT.min_chance_fault) > EDGE for chance in limits))
     assume(np.abs(np.array(friction.frictions) - LEVELS.limit).min() > EDGE)
-    found = on_board(values, raw, plan=RANGE)
+    found = on_board(values, stds, plan=RANGE)
     assert found.verdict == float(expected)
     if found.verdict != NOT_TESTED:
         assert found[:6] == pytest.approx(
