@@ -36,6 +36,7 @@ from ehadiag.identify.experiment import (
 )
 from ehadiag.identify.least_squares import Refinement, refined_with_day, refinement_at
 from ehadiag.identify.linearisation import (
+    RUN_BLOCK_SIZE,
     ConsideredParameter,
     Derivatives,
     ParameterDensity,
@@ -83,8 +84,6 @@ class ValleyRules(msgspec.Struct, frozen=True):
     ratios: tuple[float, ...] = (1.0, 5.0, 10.0)
     """Spreads of the points along them, over that of the density, 1: what was left out is explained
     within the first; right basins were 12 to 20 deviations away, of which its width is two."""
-    points: int = 96
-    """Points of each spread, 1: six blocks of runs."""
     block: int = 25
     """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
     event_cost: float = 30.0
@@ -204,13 +203,9 @@ def estimate_about(
             for items in (whole, judged):
                 evaluations += fine.evaluations
                 fine = model_of(items)
-
-                def cost(points: Array, fine: Derivatives = fine) -> Array:
-                    off = points - prior.x
-                    return _event_cost(fine.many(points)) + ((off @ information) * off).sum(axis=1)
-
-                density, valley = _search_valley(fine, partial(search, fine), before, cost, rng)
-                residuals = fine.many(density.x[None, :])[0]
+                density, residuals, valley = _search_valley(
+                    fine, partial(search, fine), before, prior, information, rng
+                )
                 creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
                 has_event = _has_event(residuals, creeps)
                 if not (has_event and settings.explains(np.where(creeps, 0.0, residuals))):
@@ -303,34 +298,45 @@ def _search_valley(
     fine: Derivatives,
     search: PosteriorSearch,
     there: ParameterDensity,
-    cost: Callable[[Array], Array],
+    prior: ParameterDensity,
+    information: Array,
     rng: np.random.Generator,
-) -> tuple[ParameterDensity, Array]:
+) -> tuple[ParameterDensity, Array, Array]:
     """Search from the best of points far along the valley in closed loop.
 
     Friction, hysteresis and backlash trade along it. Break-aways divide it into basins, of which
-    several starts may find the same wrong one. Returns the best end, and the covariance of all that
-    explain the recording as well, in units of the model's scales, shape (k, k).
-
-    cost: of points, shape (n,) for points of shape (n, k).
+    several starts may find the same wrong one. Returns the best end, the residuals there, and the
+    covariance of all that explain the recording as well, in units of the model's scales, shape (k,
+    k).
     """
     directions, widths, _ = np.linalg.svd(there.root)
-    ends = [there]
-    for ratio in VALLEY.ratios:
-        reach = widths * np.where(np.arange(len(widths)) < VALLEY.directions, ratio, 0.5)
-        points = np.repeat(there.x[None, :], VALLEY.points, axis=0)
-        shifts = rng.standard_normal((VALLEY.points, len(widths))) * reach
-        points[:, fine.curved] += shifts @ directions.T
-        points = np.clip(points, fine.lower, fine.upper)
-        best = points[np.argmin(cost(points))]
-        begin = ParameterDensity(best, FINAL_SPREAD_RATIO * there.root)
-        ends.append(search(begin=begin).density)
-    places = np.array([item.x for item in ends])
-    costs = cost(places)
-    best = int(np.argmin(costs))
-    weights = np.exp(-0.5 * (costs - costs[best]) / VALLEY.unit)
-    shifts = places - places[best]
-    return ends[best], np.asarray((shifts.T * (weights / weights.sum())) @ shifts)
+    far = np.arange(len(widths)) < VALLEY.directions
+    reach = widths * np.where(far, np.array(VALLEY.ratios)[:, None], 0.5)
+    shifts = rng.standard_normal((RUN_BLOCK_SIZE, *reach.shape)) * reach
+    shifts[0, 0] = 0.0
+    points = np.tile(there.x, (*shifts.shape[:2], 1))
+    points[..., fine.curved] += shifts @ directions.T
+    points = np.clip(points, fine.lower, fine.upper).reshape(-1, len(there.x))
+
+    def costs_of(points: Array, runs: Array) -> Array:
+        off = points - prior.x
+        return _event_cost(runs) + ((off @ information) * off).sum(axis=1)
+
+    runs = fine.many(points)
+    best = np.argmin(costs_of(points, runs).reshape(RUN_BLOCK_SIZE, -1), axis=0)
+    densities, residuals = [replace(there, x=points[0])], [runs[0]]
+    for k, place in enumerate(best):
+        begin = points[place * len(best) + k]
+        found = search(begin=ParameterDensity(begin, FINAL_SPREAD_RATIO * there.root))
+        densities.append(found.density)
+        residuals.append(found.residuals)
+    places = np.array([item.x for item in densities])
+    costs = costs_of(places, np.array(residuals))
+    end = int(np.argmin(costs))
+    weights = np.exp(-0.5 * (costs - costs[end]) / VALLEY.unit)
+    shifts = places - places[end]
+    covariance = (shifts.T * (weights / weights.sum())) @ shifts
+    return densities[end], residuals[end], np.asarray(covariance)
 
 
 def _event_cost(residuals: Array) -> Array:
