@@ -375,7 +375,8 @@ def _search_recordings(
         progress=settings.progress,
         gives_up=_give_up_test(give_up=settings.give_up, require_agreement=require_agreement),
         require_agreement=require_agreement,
-        looks_about=require_agreement and joint is None and not oil,
+        # Inexact data explain nearly all from an end beside the optimum, too.
+        looks_about=require_agreement and not (oil or priors or joint),
         confirms=settings.give_up,
         excess_before=settings.excess_before,
     )
