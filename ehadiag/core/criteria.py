@@ -204,8 +204,7 @@ class GiveUpCriteria(msgspec.Struct, frozen=True):
     sound units ended at one wrong place, with 0.01 and 0.04. Broken units leave 0.16 and more,
     mostly; spikes leave less."""
     min_confirmed_share: float = 0.98
-    """Least excess over that with fewer unknowns, and least cost over that before a further look,
-    that is no improvement, 1."""
+    """Least excess over that with fewer unknowns that is no improvement, 1."""
     max_open_loop_excess: float = 1.3
     """Largest excess of open loop alone whose density closed loop starts from, 1: with more the
     search has ended away from the optimum, with too narrow a density."""

@@ -19,6 +19,7 @@ from ehadiag.core.criteria import GIVE_UP
 from ehadiag.identify.estimates import (
     ExplanationTest,
     excess_cost,
+    explains_far_more,
     is_noise,
     is_unexplainable,
     misses_only_pressure,
@@ -173,7 +174,8 @@ def multistart_search(
         while gains and not end.explained:
             near = _density_about_end(model, end, alias, restart_root)
             other = _end_of(look(begin=near), explains)
-            gains = other.cost < GIVE_UP.min_confirmed_share * end.cost
+            left = excess_cost(other.residuals), excess_cost(end.residuals)
+            gains = explains_far_more(*left)
             end = min(end, other, key=lambda item: item.cost)
         places.append(StartEnd(end.density.x, end.cost))
         if best is None or end.cost < best.cost:
