@@ -75,25 +75,16 @@ PROFILE_HALF_WIDTH = 15
 """Half width of the likelihood profile along a valley, deviations: two blocks of runs."""
 
 
-class ValleyRules(msgspec.Struct, frozen=True):
-    """Search along the valley in which friction, hysteresis and backlash trade."""
+class BreakAwayRules(msgspec.Struct, frozen=True):
+    """Break-aways at wrong ticks."""
 
-    directions: int = 2
-    """Directions of widest spread, 1: friction, hysteresis and backlash trade at one sum."""
-    ratios: tuple[float, ...] = (1.0, 5.0, 10.0)
-    """Spreads of the points along them, over that of the density, 1: what was left out is explained
-    within the first; right basins were 12 to 20 deviations away, of which its width is two."""
-    points: int = 96
-    """Points of each spread, 1: six blocks of runs."""
     block: int = 25
     """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
     event_cost: float = 30.0
-    """Cost of a block beyond the usual from which on it counts by its logarithm."""
-    unit: float = 10.0
-    """Difference of the cost that is one variance, 1: what the model errs about break-aways."""
+    """Least cost of a block, beyond the usual one, with such a break-away."""
 
 
-VALLEY = ValleyRules()
+BREAK_AWAYS = BreakAwayRules()
 PosteriorSearch = Callable[..., PosteriorResult]
 """`search_posterior` with all but where it begins."""
 
@@ -172,13 +163,12 @@ def estimate_about(
     prior, information = prior_density(fine, *priors), prior_information(fine, *priors)
     density = ParameterDensity(found.density.x * model.scale / fine.scale, found.density.root)
     covariance = optima_covariance(found, model.scale)
-    valley = np.zeros_like(covariance)
     evaluations = staged.evaluations
-    alone = all(item.test.closed_loop and item.constants.OIL == 0.0 for item in judged)
-    along_valley = alone and settings.joint is None
+    alone = settings.joint is None and all(
+        item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
+    )
     given_up = not found.explained and (
-        is_unexplainable(found.residuals, found.starts)
-        or (along_valley and not _is_near(found.residuals))
+        is_unexplainable(found.residuals, found.starts) or (alone and not _is_near(found.residuals))
     )
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
@@ -191,7 +181,7 @@ def estimate_about(
             schedule=FINAL_SCHEDULE,
             between=no_interruption if progress is None else partial(progress, 1.0),
         )
-        if not along_valley:
+        if not alone:
             if settings.require_agreement and not found.confirmed:
                 # A break-away may stand between the end of the search and the optimum.
                 density = _search_about(
@@ -199,18 +189,13 @@ def estimate_about(
                 )
             density = _search_about(fine, search, density, FINAL_SPREAD_RATIO * density.root)
         else:
-            late, before = fine, density
+            late, begin = fine, replace(density, root=FINAL_SPREAD_RATIO * density.root)
             whole = [a.with_noise(b.noise) for a, b in zip(experiments, judged, strict=True)]
             for items in (whole, judged):
                 evaluations += fine.evaluations
                 fine = model_of(items)
-
-                def cost(points: Array, fine: Derivatives = fine) -> Array:
-                    off = points - prior.x
-                    return _event_cost(fine.many(points)) + ((off @ information) * off).sum(axis=1)
-
-                density, valley = _search_valley(fine, partial(search, fine), before, cost, rng)
-                residuals = fine.many(density.x[None, :])[0]
+                end = search(fine, begin=begin)
+                density, residuals = end.density, end.residuals
                 creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
                 has_event = _has_event(residuals, creeps)
                 if not (has_event and settings.explains(np.where(creeps, 0.0, residuals))):
@@ -223,7 +208,7 @@ def estimate_about(
     profile = _profile_covariance(fine, refined) if settings.require_agreement else 0.0
     refined = refined_with_day(fine, refined, linear)
     ambiguous = _is_hysteresis_small(refined, judged)
-    if along_valley:
+    if alone:
         # What a first start explains, and all of it, other optima do not.
         ambiguous = (ambiguous and found.starts > 1) or _has_event(
             refined.residuals, refined.weighted
@@ -233,8 +218,7 @@ def estimate_about(
         experiments=judged,
         covariance=covariance
         + independent_covariance(refined.parameters, AMBIGUOUS_STDS if ambiguous else {})
-        + profile
-        + valley * np.outer(model.scale, model.scale),
+        + profile,
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
@@ -299,69 +283,17 @@ def _search_about(
     return seen if costs[0] - costs[1] > least_gain else there
 
 
-def _search_valley(
-    fine: Derivatives,
-    search: PosteriorSearch,
-    there: ParameterDensity,
-    cost: Callable[[Array], Array],
-    rng: np.random.Generator,
-) -> tuple[ParameterDensity, Array]:
-    """Search from the best of points far along the valley in closed loop.
-
-    Friction, hysteresis and backlash trade along it. Break-aways divide it into basins, of which
-    several starts may find the same wrong one. Returns the best end, and the covariance of all that
-    explain the recording as well, in units of the model's scales, shape (k, k).
-
-    cost: of points, shape (n,) for points of shape (n, k).
-    """
-    directions, widths, _ = np.linalg.svd(there.root)
-    ends = [there]
-    for ratio in VALLEY.ratios:
-        reach = widths * np.where(np.arange(len(widths)) < VALLEY.directions, ratio, 0.5)
-        points = np.repeat(there.x[None, :], VALLEY.points, axis=0)
-        shifts = rng.standard_normal((VALLEY.points, len(widths))) * reach
-        points[:, fine.curved] += shifts @ directions.T
-        points = np.clip(points, fine.lower, fine.upper)
-        best = points[np.argmin(cost(points))]
-        begin = ParameterDensity(best, FINAL_SPREAD_RATIO * there.root)
-        ends.append(search(begin=begin).density)
-    places = np.array([item.x for item in ends])
-    costs = cost(places)
-    best = int(np.argmin(costs))
-    weights = np.exp(-0.5 * (costs - costs[best]) / VALLEY.unit)
-    shifts = places - places[best]
-    return ends[best], np.asarray((shifts.T * (weights / weights.sum())) @ shifts)
-
-
-def _event_cost(residuals: Array) -> Array:
-    """Cost of residuals, shape (…, signals, N): shape (…).
-
-    A break-away at a wrong tick costs a block of ticks, which counts by its logarithm.
-    """
-    costs, over = _block_costs(residuals)
-    capped = costs - over + VALLEY.event_cost * np.log1p(over / VALLEY.event_cost)
-    return np.asarray(capped.sum(axis=-1))
-
-
-def _block_costs(residuals: Array) -> tuple[Array, Array]:
-    """Cost of each block of residuals, shape (…, signals, N), and what it is over the usual one:
-    shape (…, blocks)."""
-    count = residuals.shape[-1] // VALLEY.block * VALLEY.block
-    blocks = residuals[..., :count].reshape(*residuals.shape[:-1], -1, VALLEY.block)
-    costs = cauchy_costs(blocks).sum(axis=(-3, -1))
-    usual = np.median(costs, axis=-1, keepdims=True)
-    return costs, np.maximum(costs - usual, 0.0)
-
-
 def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
     """Whether residuals show a break-away at a wrong tick where they count.
 
     residuals, counted: shape (signals, N).
     """
-    over = _block_costs(residuals)[1]
-    ticks = np.asarray(counted.any(axis=0))[: len(over) * VALLEY.block]
-    among = ticks.reshape(len(over), -1).any(axis=1)
-    return bool(over[among].max(initial=0.0) > VALLEY.event_cost)
+    count = residuals.shape[1] // BREAK_AWAYS.block
+    ticks = count * BREAK_AWAYS.block
+    costs = cauchy_costs(residuals[:, :ticks]).sum(axis=0).reshape(count, -1).sum(axis=1)
+    among = counted[:, :ticks].any(axis=0).reshape(count, -1).any(axis=1)
+    over = costs[among] - np.median(costs)
+    return bool(over.max(initial=0.0) > BREAK_AWAYS.event_cost)
 
 
 def optima_covariance(found: MultistartResult, scale: Array) -> Array:

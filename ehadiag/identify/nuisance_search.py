@@ -19,6 +19,7 @@ from ehadiag.core.criteria import GIVE_UP
 from ehadiag.identify.estimates import (
     ExplanationTest,
     excess_cost,
+    explains_far_more,
     is_noise,
     is_unexplainable,
     misses_only_pressure,
@@ -35,6 +36,7 @@ from ehadiag.identify.linearisation import (
 from ehadiag.identify.posterior import (
     MANY_UNKNOWNS_SCHEDULE,
     SLOW_SCHEDULE,
+    PosteriorResult,
     cauchy_cost,
     search_posterior,
 )
@@ -57,6 +59,8 @@ class RestartRules(msgspec.Struct, frozen=True):
 
     spread_share: float = 0.1
     """Spread about the best end so far, in spreads of the first."""
+    end_spread: float = 3.0
+    """Spread of a look about an end that misses only the pressure, in spreads of that end."""
     alias_half_span: float = 1.25
     """Half-width over which a parameter is moved against its alias, in units of its scale."""
     closed_loop_share: float = 0.3
@@ -120,6 +124,7 @@ def multistart_search(
     progress: Callable[[float], None] | None = None,
     gives_up: Callable[[Array, int], bool] | None = None,
     require_agreement: bool = False,
+    looks_about: bool = False,
     confirms: bool = False,
     excess_before: float = np.inf,
     coarse: float = np.inf,
@@ -137,10 +142,11 @@ def multistart_search(
     it raises ends the search; gives_up: whether further starts will not help, by the best residuals
     and the number of starts; require_agreement: whether all starts but the first are slow and from
     the last origin, until enough have ended at the same point; else every other start is near the
-    best end so far; confirms: whether an end that misses only the pressure ends the search, too,
-    where a second start agrees or the excess is that of `excess_before`; excess_before: excess of
-    another search with fewer unknowns; coarse: see `SearchSchedule`. Returns best end, and those of
-    all starts.
+    best end so far; looks_about: whether the first start looks again about its end as long as that
+    gains; confirms: whether an end that misses only the pressure ends the search, too, where a
+    second start agrees or the excess is that of `excess_before`; excess_before: excess of another
+    search with fewer unknowns; coarse: see `SearchSchedule`. Returns best end, and those of all
+    starts.
     """
     until = model.evaluations + budget
     restart_root = RESTARTS.spread_share * prior.root if restart_root is None else restart_root
@@ -164,13 +170,21 @@ def multistart_search(
             begin = ParameterDensity(_best_along_alias(model, best, alias), restart_root)
         rng = np.random.default_rng([seed, len(places)])
         linearise = partial(linearised_by_regression, rng=rng)
-        narrowed = search_posterior(model, prior, begin, information, linearise, schedule, between)
-        density, settled = narrowed.density, narrowed.settled
-        residuals = model.many(density.x[None, :])[0]
-        cost = float(cauchy_cost(residuals))
-        places.append(StartEnd(density.x, cost))
-        if best is None or cost < best.cost:
-            best = MultistartResult(density, residuals, cost, settled and explains(residuals), ())
+        look = partial(
+            search_posterior, model, prior, information=information, linearise=linearise,
+            schedule=schedule, between=between,
+        )  # fmt: skip
+        end = _end_of(look(begin=begin), explains)
+        gains = looks_about and best is None
+        while gains and not end.explained:
+            near = _density_about_end(model, end, alias, restart_root)
+            other = _end_of(look(begin=near), explains)
+            left = excess_cost(other.residuals), excess_cost(end.residuals)
+            gains = explains_far_more(*left)
+            end = min(end, other, key=lambda item: item.cost)
+        places.append(StartEnd(end.density.x, end.cost))
+        if best is None or end.cost < best.cost:
+            best = end
         confirmed = confirms and _is_confirmed(best, places, excess_before)
         if confirmed or (gives_up is not None and gives_up(best.residuals, len(places))):
             break
@@ -178,6 +192,29 @@ def multistart_search(
             break
         between()
     return replace(best, places=tuple(places), confirmed=confirmed)
+
+
+def _end_of(found: PosteriorResult, explains: Callable[[Array], bool]) -> MultistartResult:
+    """Return the end of one search."""
+    explained = found.settled and explains(found.residuals)
+    cost = float(cauchy_cost(found.residuals))
+    return MultistartResult(found.density, found.residuals, cost, explained, ())
+
+
+def _density_about_end(
+    model: Derivatives, end: MultistartResult, alias: str, root: Array
+) -> ParameterDensity:
+    """Density about the best point along the alias, see `_best_along_alias`, for a further look.
+
+    Where only the pressure is not explained, the alias alone is at a wrong place: all others stay
+    near that of the end. root: of the covariance where more than that is wrong.
+    """
+    names = [model.estimated[j].name for j in model.curved]
+    if alias in names and misses_only_pressure(end.residuals):
+        root, place = RESTARTS.end_spread * end.density.root, names.index(alias)
+        root[place], root[:, place] = 0.0, 0.0
+        root[place, place] = RESTARTS.alias_half_span / (0.5 * RUN_BLOCK_SIZE)
+    return ParameterDensity(_best_along_alias(model, end, alias), root)
 
 
 def _is_confirmed(best: MultistartResult, places: Sequence[StartEnd], excess_before: float) -> bool:
@@ -296,6 +333,7 @@ def _search_recordings(
         and before is None
         and any(item.test.closed_loop for item in experiments)
     )
+    oil = any(item.constants.OIL > 0.0 for item in experiments)
     coarse = free_run_model(experiments, settings.free)
     model = noise_scaled_model(coarse, experiments)
     first, information = (
@@ -306,15 +344,14 @@ def _search_recordings(
     if hint is not None:
         origins = [density_about(model, first, hint), *origins[::-1]]
     guide: Derivatives | None = None
-    has_oil = any(item.constants.OIL > 0.0 for item in experiments)
-    soon = settings.soon and not has_oil  # of oil the phase of the ring may be wrong
+    soon = settings.soon and not oil  # of oil the phase of the ring may be wrong
     restart_root = RESTARTS.spread_share * first.root
     if before is not None:
         there = density_of_all_recordings(before.model, before.found.density, model)
         origins, restart_root = [there], RESTARTS.closed_loop_share * there.root
         if hint is not None and not settings.hint_of_open:
             origins = [ParameterDensity(density_about(model, first, hint).x, restart_root), there]
-    elif has_oil:
+    elif oil:
         guide = _spool_guide(experiments, settings.free, coarse.levels)
         guided = multistart_search(
             guide,
@@ -349,6 +386,8 @@ def _search_recordings(
             else None
         ),
         require_agreement=require_agreement,
+        # Inexact data explain nearly all from an end beside the optimum, too.
+        looks_about=require_agreement and not (oil or priors or joint),
         confirms=settings.give_up,
         excess_before=settings.excess_before,
         coarse=RESTARTS.coarse if soon else np.inf,

@@ -115,6 +115,8 @@ class PosteriorResult(msgspec.Struct, frozen=True, eq=False):
     """The model about it, of the last round."""
     settled: bool
     """Whether the density converged."""
+    residuals: Array
+    """Weighted, at its mean, of a schedule that goes by the objective; shape (signals, N)."""
 
 
 def search_posterior(
@@ -144,7 +146,8 @@ def search_posterior(
         if schedule.flat:
             history.add(density.x, linear.middle)
             if history.is_flat:
-                return PosteriorResult(replace(density, x=history.x), linear, True)
+                density = replace(density, x=history.x)
+                return PosteriorResult(density, linear, True, history.residuals)
         share = 1.0 / (1 + max(rounds - schedule.whole_rounds, 0))
         density, ratio, step = _narrowed(
             model, linear, prior, density, information, schedule, share
@@ -155,7 +158,7 @@ def search_posterior(
     if schedule.flat:
         history.add(density.x, model.many(density.x[None, :])[0])
         density = replace(density, x=history.x)
-    return PosteriorResult(density, linear, settled)
+    return PosteriorResult(density, linear, settled, history.residuals)
 
 
 class _ObjectiveHistory:
@@ -172,13 +175,14 @@ class _ObjectiveHistory:
         self._unit = 1.0
         self.x = prior.x
         """The best place."""
+        self.residuals = np.zeros((0, 0))
 
     def add(self, x: Array, residuals: Array) -> None:
         """Add a point and the residuals there, shape (signals, N)."""
         off = x - self._prior.x
         objective = float(cauchy_cost(residuals) + off @ self._information @ off)
         if not self._objectives or objective < min(self._objectives):
-            self.x = x
+            self.x, self.residuals = x, residuals
             self._unit = objective / max(int(np.count_nonzero(residuals)), 1)
         self._objectives.append(objective)
 

@@ -87,7 +87,6 @@ def test_a_search_that_went_astray_on_a_sound_unit_goes_on(case: int) -> None:
     """A third of the residuals are outliers after a start; both were NOT TESTED once."""
     done = perform_unit(UnitCase("closed", case, seed=71))
     assert done["verdict"] == "answered"
-    assert done["attempts"] > 1
     assert np.abs(np.subtract(done["value"], done["faults"])).max() < 0.002
 
 
