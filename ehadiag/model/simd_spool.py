@@ -8,7 +8,7 @@ velocity. A lane in which an event may hide is left to `ehadiag.model.simd_spool
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined
 from ehadiag.compile.vector import (
@@ -151,7 +151,7 @@ def _quarter_matrix(coefficients: Array, o: int) -> tuple[Vector, ...]:
 @packed
 def _quarter_step(
     m: tuple[Vector, ...], a: Vector, w: Vector, b: Vector, v: Vector,
-    bow: float, dry: Vector, slowest: Vector, lowest: Vector, widest: Vector,
+    bow: float, dry: Any, slowest: Vector, lowest: Vector, widest: Vector,
 ) -> tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector]:  # fmt: skip
     """One step of the moving spool, positive along its motion, and how near it came to an event."""
     na = m[0] * a + m[1] * w + m[2] * b + m[3] * v
