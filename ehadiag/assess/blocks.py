@@ -93,8 +93,16 @@ def unexplained_block(experiments: Sequence[Experiment], modelled: Sequence[Mode
         ]
         for item, model in zip(experiments, modelled, strict=True)
     ]
-    shares = np.nan_to_num(np.concatenate(residuals, axis=1)) / ESTIMATION.cauchy_scale
-    costs = np.log1p(shares**2)
+    return block_with_most(experiments, np.concatenate(residuals, axis=1))
+
+
+def block_with_most(experiments: Sequence[Experiment], residuals: Array) -> str:
+    """Name the block with most of the residuals, by Cauchy's cost.
+
+    residuals: of spool and pressure of all experiments, one behind the other, in deviations of the
+    noise, shape (2, N). Returns one of `BLOCKS`.
+    """
+    costs = np.log1p((np.nan_to_num(residuals) / ESTIMATION.cauchy_scale) ** 2)
     masks = block_masks(experiments)
     return max(BLOCKS, key=lambda name: float(costs[masks[name]].sum()))
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from ehadiag.assess.blocks import block_with_most
 from ehadiag.assess.verdict import Levels
 from ehadiag.core.actuator import Actuator, SecondStage
 from ehadiag.estimate import Severity
@@ -399,13 +400,15 @@ def objections_to_healthy(found: NuisanceEstimate) -> list[str]:
 
 def objections_to_model(best: LearnedModel, recordings: Sequence[Recording] = ()) -> list[str]:
     """Why the best model cannot be learned from, and of which recordings it leaves something."""
+    residuals = best.estimated.refined.residuals
     reasons = [
         f"no model explains the recordings: the residuals are {best.estimated.excess:.1f} times"
         " the noise: other recordings than of one sound unit as new, another type of unit, or"
-        " an effect that no model has"
+        " an effect that no model has",
+        f"not explained: the {block_with_most(best.experiments, residuals[:2])}",
     ]
     if len(recordings) > 1:
-        parts = residuals_by_experiment(best.experiments, best.estimated.refined.residuals)
+        parts = residuals_by_experiment(best.experiments, residuals)
         bad = [
             recording.source
             for recording, part in zip(recordings, parts, strict=True)

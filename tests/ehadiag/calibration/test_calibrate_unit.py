@@ -55,6 +55,20 @@ def test_only_a_calibrated_unit_can_be_updated():
 
 
 @pytest.mark.slow
+def test_what_no_model_explains_is_named_by_its_block():
+    waved = []
+    for test in ("open", "closed"):
+        given = recording(test)
+        wave = 3e-6 * np.sin(np.arange(len(given.samples.spool)) / 40.0)
+        waved.append(
+            replace(given, samples=replace(given.samples, spool=given.samples.spool + wave))
+        )
+    reasons = refusal(waved)
+    assert "no model explains" in reasons[0]
+    assert reasons[1] == "not explained: the spool"
+
+
+@pytest.mark.slow
 @of_calibrated_unit
 def test_it_learns_the_unit_and_keeps_it_in_a_file(tmp_path):
     found = learned()
