@@ -341,7 +341,7 @@ class FreeMotionMonitor:
         return self._settled_ticks >= SETTLING_TICKS
 
     def settle(self) -> None:
-        """Let the modelled spool settle again, from the present state; until then no alarm counts."""
+        """Let the modelled spool settle again from its present state; till then no alarm counts."""
         self._settled_ticks = 0
 
     def push(self, sample: tuple[float, float, float, float, float]) -> Reading:

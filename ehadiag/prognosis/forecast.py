@@ -35,7 +35,7 @@ class ForecastRules(msgspec.Struct, frozen=True):
     alarm_rate: float = 1e-3
     """Share of the diagnoses of ordinary wear that raise a false alarm, 1."""
     tail_chance: float = 0.05
-    """Share of the surprises, 1, that form their tail, which is taken as exponential."""
+    """Share of the surprises (see `surprises`), 1, that form their tail, taken as exponential."""
     min_surprises: int = 40
     """Least number of surprises; draws of a normal density make up for missing ones."""
     min_fall: float = 0.02
@@ -244,6 +244,6 @@ def _surprise(own: OwnLife, fleet: Fleet, unit: str) -> str:
     if change < 0.0:
         return f"{what} {unit}: {NOTE_NO_WEAR}"
     return (
-        f"{what} {unit}: {abs(mine[worst]):.0f} deviations from what was expected, sound wear stays"
-        f" within {bound:.0f} in {1.0 - RULES.alarm_rate:.1%} of diagnoses"
+        f"{what} {unit}: {abs(mine[worst]):.0f} deviations from what was expected, ordinary wear"
+        f" stays within {bound:.0f} in {1.0 - RULES.alarm_rate:.1%} of diagnoses"
     )
