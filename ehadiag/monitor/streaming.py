@@ -352,9 +352,9 @@ class FreeMotionMonitor:
             self._pause_left = PAUSE_TICKS
         if self._travel > 0.0:
             positions = self._positions
-            if math.isfinite(position):
-                positions.append(position)
-            if len(positions) <= SLIP_TICKS or abs(positions[-1] - positions[0]) < self._travel:
+            positions.append(position)
+            slides = abs(positions[-1] - positions[0]) >= self._travel  # not of a lost position
+            if len(positions) <= SLIP_TICKS or not slides:
                 self._pause_left = PAUSE_TICKS
         if self._pause_left:
             self._pause_left -= 1
