@@ -105,6 +105,8 @@ def test_a_play_beyond_its_limit_stands_for_friction_where_more_than_noise_is_le
     note = note_on_stand_ins(found(doubtful, **{name: (size, 1e-9)}), doubtful)
     assert bool(note) is stands_in
     assert note_on_stand_ins(found(**{name: (size, 1e-9)}), NOISE) == ""
+    without_limit = [replace(item, limit=None) for item in found(doubtful, **{name: (size, 1e-9)})]
+    assert note_on_stand_ins(without_limit, doubtful) == ""
 
 
 def test_searches_that_leave_more_than_noise_in_closed_loop_are_an_objection():
