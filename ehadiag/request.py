@@ -24,7 +24,7 @@ from firmware_iface.recording import MAX_CAN_ID
 MOST_SEED = (1 << 32) - 1
 """Largest seed of random numbers, 1."""
 TEST = "open|closed|NUMBER|FILE"
-"""How every command lets a test be named."""
+"""Ways to name a test, in the help of every command."""
 
 
 def _option(name: str, text: str, metavar: str | None = None, **extra: Any) -> Meta:
@@ -247,7 +247,7 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def levels(self) -> Levels:
-        """Advisory level and limit, with the rule that holds them against a severity."""
+        """Advisory level and limit, with the rule that compares a severity with them."""
         return Levels(self.advisory, self.limit, VerdictRule(self.rule))
 
     @property
@@ -261,7 +261,7 @@ class Option(msgspec.Struct, frozen=True):
 
     name: str
     flag: str
-    """Of the command line; empty for what is no option."""
+    """Name of the command-line option; empty for a field that has none."""
     kind: type[Any]
     """`bool`, `int`, `float` or `str`."""
     many: bool
@@ -275,7 +275,7 @@ class Option(msgspec.Struct, frozen=True):
     metavar: str | None
     help: str
     project: bool
-    """Whether a project's file may set it."""
+    """Whether a project's `ehadiag.toml` may set it."""
     file: bool
     """Whether its values name files."""
 
@@ -299,7 +299,7 @@ class Option(msgspec.Struct, frozen=True):
     def read(self, text: str) -> Any:
         """Read one value from the command line.
 
-        ValueError: it takes no such value.
+        ValueError: the option takes no such value.
         """
         value: Any = text
         if self.kind is int:
@@ -313,8 +313,8 @@ class Option(msgspec.Struct, frozen=True):
     def checked(self, value: Any) -> Any:
         """Return a value as the field holds it.
 
-        value: of the field; one text or path stands for several as well. Returns a plain number,
-        text, or tuple of texts. ConfigurationError: it takes no such value.
+        value: of the field; one text or path may stand for a tuple of one. Returns a plain number,
+        text, or tuple of texts. ConfigurationError: the option takes no such value.
         """
         if value is None and self.optional:
             return None
@@ -355,7 +355,7 @@ class Option(msgspec.Struct, frozen=True):
 
 @cache
 def request_options() -> dict[str, Option]:
-    """Fields of `Request` by name, with all that their metadata say.
+    """Fields of `Request` by name, with what their annotations state.
 
     Returns in the order of the fields.
     """
@@ -367,18 +367,18 @@ def request_options() -> dict[str, Option]:
 
 
 def _option_of(field: msgspec.structs.FieldInfo, hint: Any) -> Option:
-    """Take a field's annotation apart: nested ones are one list of `Meta`, the innermost first."""
-    plain = [item for item in get_args(hint) if isinstance(item, Meta)]
+    """Describe a field by its annotation; the `Meta` of nested ones are joined, innermost first."""
+    metas = [item for item in get_args(hint) if isinstance(item, Meta)]
     kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     optional = type(None) in get_args(kind)
     if optional:
         kind = next(item for item in get_args(kind) if item is not type(None))
     if get_origin(kind) is Annotated:
-        plain = [*(item for item in get_args(kind) if isinstance(item, Meta)), *plain]
+        metas = [*(item for item in get_args(kind) if isinstance(item, Meta)), *metas]
         kind = get_args(kind)[0]
     many = get_origin(kind) is tuple
     choices = tuple(get_args(kind)) if get_origin(kind) is Literal else ()
-    extra: dict[str, Any] = plain[-1].extra or {}
+    extra: dict[str, Any] = metas[-1].extra or {}
     return Option(
         name=field.name,
         flag=extra.get("option", ""),
@@ -387,9 +387,9 @@ def _option_of(field: msgspec.structs.FieldInfo, hint: Any) -> Option:
         optional=optional,
         default=field.default,
         choices=choices,
-        bounds=plain[0],
+        bounds=metas[0],
         metavar=extra.get("metavar"),
-        help=plain[-1].description or "",
+        help=metas[-1].description or "",
         project=bool(extra.get("project")),
         file=bool(extra.get("file")),
     )

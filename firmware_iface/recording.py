@@ -346,7 +346,7 @@ class BitOutcome(msgspec.Struct, frozen=True):
 
 
 class OnboardResult(msgspec.Struct, frozen=True):
-    """What the flight-control computer says that it has found itself in a test (BUS-18)."""
+    """The flight-control computer's own result of a test (BUS-18)."""
 
     test_id: int | None
     """Number of the test; None where it does not say."""
@@ -381,7 +381,7 @@ class Recording(msgspec.Struct, frozen=True, eq=False):
     start_ns: int | None = None
     """Host time of the test's first sample, ns since the epoch (or the log's start)."""
     onboard: OnboardResult | None = None
-    """What the computer has found itself; None where it did not say."""
+    """The computer's own result; None: it sent none."""
     by_time: bool = False
     """No counter told the samples' ticks: one message's may be placed later than another's."""
     out_of_order: float = 0.0

@@ -116,7 +116,7 @@ class Requester(Protocol):
 
     @property
     def second_sender(self) -> str:
-        """What gives away that somebody else answers as the computer does; empty if nothing."""
+        """Evidence that another node answers in the computer's place; empty if there is none."""
 
     @property
     def pending(self) -> bool:
@@ -124,7 +124,7 @@ class Requester(Protocol):
 
     @property
     def awaited(self) -> bool:
-        """Whether what the computer finds itself is still to come."""
+        """Whether the computer's own result is still to come."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -143,10 +143,10 @@ class Requester(Protocol):
         """Forget a start that is not sent yet: the session has decided to end."""
 
     def request_results(self) -> None:
-        """Begin to ask what the computer has found itself in the test, which is over."""
+        """Begin to ask for the computer's own result of the test, which is over."""
 
     def onboard(self, test_id: int | None) -> OnboardResult | None:
-        """Return what the computer has found itself in a test; None: nothing."""
+        """Return the computer's own result of a test; None: there is none."""
 
 
 class NativeRequester:
@@ -162,7 +162,7 @@ class NativeRequester:
 
     @property
     def awaited(self) -> bool:
-        """Whether the computer is at it, or has not yet said all."""
+        """Whether the computer still identifies, or has not yet sent all of its result."""
         return self._onboard.awaited
 
     def request(self, action: HandshakeAction, test_id: int, now: int) -> Sequence[Frame]:
@@ -185,7 +185,7 @@ class NativeRequester:
         """Ask nothing: the computer sends its result of its own."""
 
     def onboard(self, test_id: int | None) -> OnboardResult | None:
-        """Return what the computer has found itself in a test; None: nothing."""
+        """Return the computer's own result of a test; None: there is none."""
         return self._onboard.of_test(test_id)
 
 
@@ -222,7 +222,7 @@ class RequestOutcome(msgspec.Struct, frozen=True):
     recorded: tuple[Path, ...]
     """Files that hold the raw frames."""
     onboard: OnboardResult | None = None
-    """What the computer has found itself; None where it did not say."""
+    """The computer's own result; None: it sent none."""
     notes: tuple[str, ...] = ()
     """Identification data of the computer, one sentence each."""
 
@@ -257,7 +257,7 @@ def run_test(
     stop: when set, the test is aborted; progress: called with the state of the test as it runs;
     all_there: asked once, when the computer has said that the test is complete: whether no frame of
     it may still come, so that there is nothing left to listen for; onboard_wait: how long to listen
-    on, s, for what the computer finds itself, where it says that it is at it. Returns how the test
+    on, s, for the computer's own result, where it says that it identifies. Returns how the test
     ended, and the frames that were recorded. ConfigurationError: `transmit` without a test number
     or on a transport that listens only, a protocol whose packages are not there; InputOutputError:
     the recording cannot be written (an abort was requested).
@@ -367,7 +367,7 @@ class _BitSession:
             self._send(self._requester.due(now))
 
     def _listen_on(self, source: FrameSource, stop: threading.Event) -> None:
-        """Hear what the computer finds itself in the complete test."""
+        """Listen for the computer's own result of the complete test."""
         verdict = self._machine.verdict
         if verdict is None or not verdict.complete:
             return

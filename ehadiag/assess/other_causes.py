@@ -146,8 +146,10 @@ def note_on_stand_ins(effects: Sequence[Effect], fit: Fit) -> str:
     if not is_explained_by_discrepancy_alone(fit):
         return ""
     for item in effects:
-        chance = chance_beyond(item.value or 0.0, item.std or 0.0, item.limit or 0.0)
-        if item.name in PLAYS and chance >= VERDICT.min_chance_beyond_limit:
+        if item.name not in PLAYS or item.limit is None:
+            continue
+        chance = chance_beyond(item.value or 0.0, item.std or 0.0, item.limit)
+        if chance >= VERDICT.min_chance_beyond_limit:
             return (
                 f"{_size(item)} would be beyond {_limit(item)}, while more than noise is left:"
                 " friction of another law passes for it"
@@ -177,8 +179,8 @@ class SuspectSearch(msgspec.Struct, frozen=True):
     """Number of suspects that are refined, 1."""
     min_tried_share: float = 0.1 * FIT.min_suspect_share
     """Least share of the unexplained cost that a step promises, and then explains, for the next
-    trial, 1: of 140 that were named 139 promised it, and a refinement makes up to nine times as
-    much of it."""
+    trial, 1: a tenth of what names a parameter, since a refinement makes up to nine times as much
+    of it; of 140 that were named 139 promised it."""
     steps: int = 2
     """Steps of that refinement, 1."""
     ridge: float = 1e-6

@@ -342,7 +342,7 @@ def objections_to_supply(
         flat = RESPONSE.min_pressure_excess_stds * experiment.pressure_noise
         margin = max(flat, RESPONSE.min_pressure_excess_share * abs(top))
         # A peak that is only lower than the model's is none that is cut off.
-        cut = (expected > top + margin) & (got > top - flat)
+        cut = (expected > top + margin) & (got > top - margin)
         if np.count_nonzero(cut) > RESPONSE.max_pressure_excess_ticks:
             return [
                 f"the pressure stops at {side * top * 1e-6:.2f} MPa where the model goes on to "

@@ -54,7 +54,7 @@ OPTIONS_UNUSED_BY_LIST = (
     "joint", "out", "report", "signals", "history", "hours", "cycles", "results", "resume",
     "junit", "summary",
 )  # fmt: skip
-"""Options that say what becomes of a diagnosis."""
+"""Options on making or writing a diagnosis: `--list` makes none."""
 UNSET_VALUES: tuple[object, ...] = (None, False, [])
 
 
@@ -111,7 +111,7 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
     history = results.snapshot()
-    if history is not None:  # a copy loads its files anew
+    if history is not None:  # a changed setup loads its files again
         setups = [replace(setup, history=history) for setup in setups]
     print_compiling_notice()
     if arguments.merge:
@@ -128,10 +128,10 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
 def _refuse_diagnose_contradictions(arguments: argparse.Namespace) -> None:
     if arguments.joint and arguments.merge:
         raise ConfigurationError("--merge: with --joint each log is a recording of its own")
-    alone = "--joint" if arguments.joint else "--merge" if arguments.merge else ""
+    whole = "--joint" if arguments.joint else "--merge" if arguments.merge else ""
     for name in ("results", "resume", "junit", "summary", "cluster", "jobs"):
-        if alone and getattr(arguments, name):
-            raise ConfigurationError(f"--{name}: {alone} gives one result, and has no use for it")
+        if whole and getattr(arguments, name):
+            raise ConfigurationError(f"--{name}: {whole} gives one result, and has no use for it")
     for name in ("jobs", "cluster"):
         if (arguments.report or arguments.signals) and getattr(arguments, name):
             option = "--report" if arguments.report else "--signals"
@@ -148,7 +148,7 @@ def _output_files(arguments: argparse.Namespace) -> list[OutputFile]:
 
 
 def _loaded(unit: ActuatorArguments) -> Setup:
-    """Return what the command line names for one actuator; what is wrong with it is said here."""
+    """Load the setup of one actuator, to raise errors of its files before a log is read."""
     setup = options.setup_of(unit.arguments, unit.label)
     _ = setup.sources, setup.actuator, setup.prior
     return setup
@@ -175,7 +175,7 @@ def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInp
 
 
 def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
-    """Diagnose one recording that lies in several files."""
+    """Diagnose one recording that is split over several files."""
     names = [_readable(item) for item in inputs]
     with progress_bar() as progress:
         reading = setup.read(*names, progress=progress)
@@ -187,21 +187,21 @@ def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogIn
 
 
 def _readable(item: LogInput) -> str:
-    """Name of an input; InputOutputError where it is known that it cannot be read."""
+    """Name of an input; InputOutputError: it was found unreadable when the names were expanded."""
     if item.why:
         raise InputOutputError(item.why)
     return item.name
 
 
 def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
-    """Print what the logs hold of one actuator."""
-    arguments, of = unit.arguments, f" ({unit.label})" if unit.label else ""
+    """Print the tests of one actuator in each log."""
+    arguments, suffix = unit.arguments, f" ({unit.label})" if unit.label else ""
     if unused := [
         name for name in OPTIONS_UNUSED_BY_LIST if getattr(arguments, name) not in UNSET_VALUES
     ]:
         named = ", ".join(f"--{name}" for name in unused)
         print_status(f"--list diagnoses none, and has no use for {named}")
-    # Whichever test is named once, all are listed.
+    # `--test` makes further tests known; it does not choose which ones are listed.
     setup = options.setup_of(arguments)
     codes: list[int] = []
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
@@ -210,7 +210,7 @@ def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
             names = [_readable(item) for item in group]
             with progress_bar() as progress:
                 tests = list(list_tests(setup, *names, progress=progress))
-            print_test_list(", ".join(names) + of, tests, as_json=arguments.json)
+            print_test_list(", ".join(names) + suffix, tests, as_json=arguments.json)
     return exit_code_of_inputs(codes)
 
 
@@ -284,7 +284,7 @@ def _page_path_of(result: Path) -> Path:
 
 
 def _redrawn(arguments: argparse.Namespace, path: Path, result: Result) -> Result:
-    """Diagnose the result's recordings once more, as it says that they were; draw from that."""
+    """Return a result with signals to draw: its recordings diagnosed again by its request."""
     named = result.request.logs or tuple(item.source for item in result.origins)
     paths = [item.log.path for item in result.origins if item.log is not None]
     files = [_at_hand(name, path, paths[place:]) for place, name in enumerate(named)]
@@ -320,13 +320,13 @@ def _redrawn(arguments: argparse.Namespace, path: Path, result: Result) -> Resul
 
 
 def _at_hand(name: str, result: Path, paths: list[str]) -> str | None:
-    """Return a log's file: as it was named, beside the result, or where it was."""
+    """Return a log's file: by its name, beside the result, or at its stored path."""
     places = [Path(name), result.parent / name, result.parent / Path(name).name, *map(Path, paths)]
     return next((str(item) for item in places if item.is_file()), None)
 
 
 def _request(arguments: argparse.Namespace, stored: Request) -> Request:
-    """Return what was asked for, with what the command line says of where things are now."""
+    """Return the stored request, with the files and bus options of this command line."""
     options_of, own = request_options(), options.request_of(arguments)
     names = ("test", "actuator", *options.BUS, *options.READING)
     given = {name: getattr(own, name) for name in names}
@@ -340,7 +340,7 @@ def _is_same_diagnosis(found: Result, stored: Result) -> bool:
         other = stored.severities.get(name)
         if other is None or (item.estimate is None) != (other.estimate is None):
             return False
-        # A larger difference from the stored estimate: the recording is another's.
+        # A larger difference shows another recording than the stored result's.
         if item.estimate is not None and abs(item.value - other.value) >= 1e-3:
             return False
     return True

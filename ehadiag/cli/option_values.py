@@ -224,8 +224,8 @@ def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transpor
         "interface": arguments.interface or "",
         "extra": _interface_options(arguments.bus_kwargs),
     }
-    names = BusOptions.__struct_fields__
-    options = BusOptions(**{name: getattr(arguments, name, None) for name in names} | named)
+    others = [name for name in BusOptions.__struct_fields__ if name not in named]
+    options = BusOptions(**{name: getattr(arguments, name) for name in others} | named)
     if arguments.context or not arguments.interface:
         from firmware_iface.transport.adapters import with_configuration  # noqa: PLC0415
 

@@ -364,13 +364,19 @@ class ResultWriter:
         if draw is not None and self.pictures:
             yield "picture", ".png", draw
         if self._arguments.report:
-            levels = Levels(self._arguments.advisory, self._arguments.limit)
-            page = partial(diagnosis_html_page, result, levels, self._keeper.place)
-            yield "report", ".html", page
+            yield "report", ".html", partial(self._page, result)
         for kind in self._signals if result.can_be_drawn else ():
-            from ehadiag.report.signal_files import signal_file  # noqa: PLC0415 - slow
+            yield "signals", f".signals.{kind}", partial(_signals, result, kind)
 
-            yield "signals", f".signals.{kind}", partial(signal_file, result, kind)
+    def _page(self, result: Result) -> bytes:
+        levels = Levels(self._arguments.advisory, self._arguments.limit)
+        return diagnosis_html_page(result, levels, self._keeper.place)
+
+
+def _signals(result: Result, kind: str) -> bytes:
+    from ehadiag.report.signal_files import signal_file  # noqa: PLC0415 - slow
+
+    return signal_file(result, kind)
 
 
 def _numbered_stems(name: str) -> Iterator[str]:

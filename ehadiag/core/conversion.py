@@ -24,18 +24,18 @@ from firmware_iface.recording import (
 
 
 class StepLimits(msgspec.Struct, frozen=True):
-    """Limits by which the step of a converter shows in its values."""
+    """Limits of the search for a converter's step in its values."""
 
     levels: int = 30
-    """Least different values."""
+    """Least number of different values."""
     single: float = 1.6
-    """Least distances: a bus that rounds codes again moves each by half its own step at most."""
+    """Largest ratio of one step to the least one seen: a bus that rounds codes again varies it."""
     same: float = 1e-6
     """Share of the range within which two values are the same, in single precision."""
     deviation: float = 0.26
-    """Steps by which values may be off whole steps: a bus that rounds to half a step."""
+    """Steps by which a value may be off whole steps: a bus may round to half a step."""
     share: float = 0.99
-    """Least share of the values so near."""
+    """Least share of the values that are off by no more."""
     tolerance: float = 0.005
     """Relative distance within which a step is the expected one."""
     ratio: float = 4.0
@@ -46,23 +46,23 @@ STEPS = StepLimits()
 
 
 def observed_step(values: NDArray[np.float64]) -> float | None:
-    """Return the step of which all values are whole numbers, but for a constant.
+    """Return the step of which all values, less a constant, are whole multiples.
 
     values: samples of one channel, shape (n,); what is not finite does not count. Returns in the
-    unit of the values; None where too few different values, or none of such a step, are there:
-    resampled or exact data.
+    unit of the values; None: too few different values, or no such step, as in resampled or exact
+    data.
     """
     known = values[np.isfinite(values)]
     levels = np.unique(known)
     if levels.size < STEPS.levels:
         return None
-    apart = np.diff(levels)
-    apart = apart[apart > STEPS.same * (levels[-1] - levels[0]) / STEPS.levels]
-    if apart.size < STEPS.levels - 1:
+    distances = np.diff(levels)
+    distances = distances[distances > STEPS.same * (levels[-1] - levels[0]) / STEPS.levels]
+    if distances.size < STEPS.levels - 1:
         return None
-    least = float(apart.min())
-    step = float(apart[apart < STEPS.single * least].mean())
-    # Neighbours first: an error of the step grows with the distance that it is used over.
+    least = float(distances.min())
+    step = float(distances[distances < STEPS.single * least].mean())
+    # Steps are counted between neighbours: over more of them an error of the step would add up.
     for _ in range(3):
         number = np.cumsum(np.concatenate([[0.0], np.rint(np.diff(levels) / step)]))
         centred = number - number.mean()
@@ -83,8 +83,8 @@ class Conversion(NamedTuple):
 def actuator_channels(actuator: Actuator) -> Channels:
     """Converters of an actuator, as its file states them.
 
-    Of one that it leaves out the range of PHY-23 is assumed, or 1.25 times the actuator's reach
-    where that is beyond it, in 4096 steps.
+    A converter that the file leaves out has the range of PHY-23 or, where the channel's largest
+    value is beyond it, 1.25 times that value, in 4096 steps.
     """
     return stated_channels((), actuator)
 
@@ -92,10 +92,10 @@ def actuator_channels(actuator: Actuator) -> Channels:
 def stated_channels(stated: tuple[StatedConverter | None, ...], actuator: Actuator) -> Channels:
     """Converters as mapping and actuator file state them, see `actuator_channels`.
 
-    stated: by the mapping, which comes first, of each channel; empty: nothing.
+    stated: the mapping's statement on each channel, which comes first; empty: none on any.
     """
     statements = stated or (None,) * len(CHANNELS)
-    own = (_filed_channel(actuator, channel) for channel in CHANNELS)
+    own = (_channel_in_file(actuator, channel) for channel in CHANNELS)
     return Channels(
         *(_with_statement(item, channel) for item, channel in zip(statements, own, strict=True))
     )
@@ -103,7 +103,7 @@ def stated_channels(stated: tuple[StatedConverter | None, ...], actuator: Actuat
 
 def range_is_stated(stated: StatedConverter | None, actuator: Actuator, channel: Channel) -> bool:
     """Tell whether mapping (`stated`) or actuator file say what range a converter has."""
-    return _filed_converter(actuator, channel) is not None or (
+    return _converter_in_file(actuator, channel) is not None or (
         stated is not None and stated.low is not None
     )
 
@@ -121,8 +121,8 @@ def largest_value(actuator: Actuator, channel: Channel) -> float:
 def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
     """Converters that samples went through.
 
-    A step that neither mapping nor actuator file states is the smallest one that the samples show,
-    which may be coarser than the bus's own, or else the assumed one. A sample is at an end if the
+    Where neither mapping nor actuator file states a step, the samples show it, perhaps a coarser
+    one than the bus has; else that of `actuator_channels` is assumed. A sample is at an end if the
     bus said so, or if it lies at the end of a range that is stated.
 
     Returns converters, and which samples stood at their ends.
@@ -133,13 +133,13 @@ def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
         zip(statements, stated_channels(samples.stated, actuator), strict=True)
     ):
         values = np.asarray(getattr(samples, channel.name))
-        filed = _filed_converter(actuator, channel) is not None
-        if not filed and (item is None or item.step is None):
+        in_file = _converter_in_file(actuator, channel) is not None
+        if not in_file and (item is None or item.step is None):
             channels.append(_with_observed_step(values, channel))
         else:
             channels.append(channel)
         low, high = (None, None) if item is None else (item.low, item.high)
-        if filed and low is None:
+        if in_file and low is None:
             low, high = -channel.full_scale, channel.full_scale - channel.lsb
         if low is not None and high is not None:
             lower, upper = end_thresholds(low, high, channels[-1].lsb)
@@ -150,7 +150,7 @@ def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
     return Conversion(Channels(*channels), saturated)
 
 
-def _filed_converter(actuator: Actuator, channel: Channel) -> ConverterSpec | None:
+def _converter_in_file(actuator: Actuator, channel: Channel) -> ConverterSpec | None:
     """What the actuator file says of a converter, if anything."""
     if actuator.converters is msgspec.UNSET:
         return None
@@ -158,8 +158,8 @@ def _filed_converter(actuator: Actuator, channel: Channel) -> ConverterSpec | No
     return None if found is msgspec.UNSET else found
 
 
-def _filed_channel(actuator: Actuator, usual: Channel) -> Channel:
-    item = _filed_converter(actuator, usual)
+def _channel_in_file(actuator: Actuator, usual: Channel) -> Channel:
+    item = _converter_in_file(actuator, usual)
     if item is not None:
         return replace(usual, full_scale=item.full_scale, levels=float(1 << item.bits))
     largest = largest_value(actuator, usual)
@@ -167,7 +167,7 @@ def _filed_channel(actuator: Actuator, usual: Channel) -> Channel:
 
 
 def _with_statement(stated: StatedConverter | None, channel: Channel) -> Channel:
-    """A converter with what the mapping says of it in the place of what was known."""
+    """A converter, with the range and step that the mapping states in place of its own."""
     if stated is None:
         return channel
     if stated.low is not None and stated.high is not None:
@@ -178,7 +178,7 @@ def _with_statement(stated: StatedConverter | None, channel: Channel) -> Channel
 
 
 def _with_observed_step(values: NDArray[np.float64], channel: Channel) -> Channel:
-    """A converter with the step that its values show, where that is another one."""
+    """A converter with the step that its values show, unless as expected or far too coarse."""
     step = observed_step(values)
     if step is None or step > STEPS.ratio * channel.lsb:
         return channel

@@ -22,13 +22,13 @@ HISTORY_COLUMNS: dict[str, type] = {
     "low95": float, "high95": float, "at_bound": int, "shown": int, "recording": str,
     "sha256": str, "withdrawn": str,
 }  # fmt: skip
-"""Columns with the kinds of their values."""
+"""Columns with the types of their values."""
 NEEDED_COLUMNS = ("when", "actuator", "serial", "verdict", "severity", "estimate", "std")
 COLUMN_RANGES = {
     "hours": (0.0, 1e9), "cycles": (0.0, 1e9), "estimate": (0.0, 1.0), "std": (1e-9, 1e3),
     "low95": (-1e4, 1e4), "high95": (-1e4, 1e4),
 }  # fmt: skip
-"""What is read; a severity that a test does not show has a wide interval, none has none."""
+"""Ranges of the numbers that are read; wide for intervals: a test may not show a severity."""
 FORMULA_PREFIXES = ("=", "+", "-", "@", "\t", "\r")
 IMPORT_SCHEMA = "ehadiag.history-import/1"
 KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
@@ -37,8 +37,8 @@ KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
 def history_csv(entries: Sequence[Entry]) -> str:
     """Write entries as CSV (RFC 4180); one line without a severity where nothing was identified.
 
-    Returns with a head; empty cells where there is no number. A text that a spreadsheet would take
-    for a formula begins with an apostrophe.
+    Returns with a row of column names; a missing number is an empty cell. A text that a spreadsheet
+    would take for a formula begins with an apostrophe.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\r\n")
@@ -93,9 +93,8 @@ def entries_from_csv(text: str, name: str, severities: Sequence[str]) -> list[En
     """Read diagnoses of another system, in the columns of an exported CSV file.
 
     text: rows of one number, time, actuator and serial number are one diagnosis; name: of the file,
-    for errors; severities: names that there are. Returns entries that are not appended yet;
-    withdrawn rows are left out. ConfigurationError: a column is missing, or a cell is none of its
-    kind.
+    for errors; severities: the known names. Returns entries that are not appended yet; withdrawn
+    rows are left out. ConfigurationError: a column is missing, or a cell does not fit its column.
     """
     reader = csv.DictReader(io.StringIO(text, newline=""))
     missing = [item for item in NEEDED_COLUMNS if item not in (reader.fieldnames or ())]

@@ -26,8 +26,8 @@ JACK_STATIC_FRICTION_RATIO = 2.0
 MIN_STRIBECK_VELOCITY = 1e-5
 """Stribeck velocity below which it is not felt, m/s."""
 MAX_DECAY_EXPONENT = 40.0
-BRIDGE_ROUNDS = 12
-"""Rounds of the iteration for the first stage's pressures, 1: to 1e-4 of a severity."""
+BRIDGE_ROUNDS = 24
+"""Rounds of the regula falsi (Illinois) for the first stage's pressures, 1: to 1e-9 of a speed."""
 
 plant_of = unpacker(PlantConstants)
 """Compiled: the constants that a row of `PLANT_FIELDS` numbers holds."""
@@ -97,61 +97,76 @@ closed nozzle gives 0.8 of the supply, and the filter's loss less."""
 
 
 @inlined
-def bridge_supply(part: float, flow: float) -> float:
-    """Pressure behind the filter over that at no load, 1 (PHY-43).
+def bridge_load(part: float, near: float, far: float, flow: float) -> tuple[float, float]:
+    """Load on a spool between a bridge's ends, and its speed, by the flow into them (PHY-43).
 
-    part: the latter over the valve's supply, 1; flow: square of the bridge's, over its supply and
-    over that at no load.
+    part: pressure behind the filter at no load over the valve's supply, 1; near, far: openings of
+    the nozzles over that in the middle, 1; flow: over the largest one of the pressure behind the
+    filter, 0 … 1. With u² and w² the pressures at the ends over that one, the one end's inlet feeds
+    the nearer nozzle and the spool, the other's with the spool the further nozzle. Returns the load
+    over the pressure at no load, and the speed over that without a load at a deflection of 1.
     """
-    return 1.0 / (part + (1.0 - part) * flow)
+    by_near, by_far = 1.0 / (1.0 + near * near), 1.0 / (1.0 + far * far)
+    u = (math.sqrt(max(1.0 + near * near - flow * flow, 0.0)) - near * flow) * by_near
+    w = (math.sqrt(max(1.0 + far * far - flow * flow, 0.0)) + far * flow) * by_far
+    total = near * u + far * w
+    supply = 1.0 / (part + (1.0 - part) * 0.5 * total * total)
+    return supply * (u * u - w * w), flow * math.sqrt(2.0 * supply)
 
 
 @inlined
 def bridge_stall(part: float, load: float) -> float:
     """Deflection at which a resting spool's ends carry a load, 1 over the nozzle's gap (PHY-43).
 
-    part: see `bridge_supply`; load: pressure over that behind the filter at no load, 1.
+    part, load: see `bridge_load`.
     """
-    x, supply = 0.0, 1.0
+    if load <= 0.0:
+        return 0.0
+    low, below, high = 0.0, -load, MAX_STALL_DEFLECTION
+    above = bridge_load(part, max(1.0 - high, 0.0), 1.0 + high, 0.0)[0] - load
+    if above <= 0.0:
+        return high
+    x, side = 0.0, 0
     for _ in range(BRIDGE_ROUNDS):
-        x = min(0.25 * load / supply * (4.0 + x * x * x * x), MAX_STALL_DEFLECTION)
-        near, far = max(1.0 - x, 0.0), 1.0 + x
-        total = near / math.sqrt(1.0 + near * near) + far / math.sqrt(1.0 + far * far)
-        supply = bridge_supply(part, 0.5 * total * total)
+        x = (low * above - high * below) / (above - below)
+        value = bridge_load(part, max(1.0 - x, 0.0), 1.0 + x, 0.0)[0] - load
+        if value == 0.0:
+            break
+        if value < 0.0:
+            low, below, above = x, value, above * (0.5 if side < 0 else 1.0)
+            side = -1
+        else:
+            high, above, below = x, value, below * (0.5 if side > 0 else 1.0)
+            side = 1
     return x
 
 
 @inlined
-def bridge_speed(part: float, load: float, x: float) -> float:
+def bridge_speed(part: float, load: float, viscous: float, x: float) -> float:
     """Speed of a spool by a deflection, over that without a load at a deflection of 1 (PHY-43).
 
-    part, load: see `bridge_stall`; x: over the nozzle's gap, 1. Of the pressures at the spool's
-    ends u² and w², over the supply at no load, the one end's inlet feeds the nearer nozzle and the
-    spool, the other's with the spool the further nozzle.
+    part, load: see `bridge_load`; viscous: further load by the speed, 1; x: over the nozzle's gap,
+    1. 0 where the load holds the spool.
     """
-    near, far, half = max(1.0 - x, 0.0), 1.0 + x, math.sqrt(0.5)
-    flow, supply = max(x - load, 0.0) * half, 1.0
+    near, far = max(1.0 - x, 0.0), 1.0 + x
+    low, above = 0.0, bridge_load(part, near, far, 0.0)[0] - load
+    if above <= 0.0:
+        return 0.0
+    carried, speed = bridge_load(part, near, far, 1.0)
+    high, below, side = 1.0, carried - load - viscous * speed, 0
     for _ in range(BRIDGE_ROUNDS):
-        by_near, by_far = 1.0 / (1.0 + near * near), 1.0 / (1.0 + far * far)
-        root_u = math.sqrt(max(supply / by_near - flow * flow, 0.0))
-        root_w = math.sqrt(max(supply / by_far - flow * flow, 0.0))
-        u, w = (root_u - near * flow) * by_near, (root_w + far * flow) * by_far
-        slope_u = -(flow / max(root_u, 0.1) + near) * by_near
-        slope_w = (far - flow / max(root_w, 0.1)) * by_far
-        flow -= (u * u - w * w - load) / (2.0 * (u * slope_u - w * slope_w))
-        total = near * u + far * w
-        supply = 0.5 * (supply + bridge_supply(part, 0.5 * total * total / supply))
-    return flow / half
-
-
-@inlined
-def bridge_velocity(part: float, load: float, x: float, unit: float, viscous: float) -> float:
-    """Velocity of a spool by a deflection, against viscous friction as well, m/s (PHY-43).
-
-    unit: at a `bridge_speed` of 1, m/s; viscous: load by the velocity, s/m.
-    """
-    velocity = unit * bridge_speed(part, load, x)
-    return unit * bridge_speed(part, load + viscous * velocity, x)
+        flow = (low * below - high * above) / (below - above)
+        carried, speed = bridge_load(part, near, far, flow)
+        value = carried - load - viscous * speed
+        if value == 0.0:
+            break
+        if value > 0.0:
+            low, above, below = flow, value, below * (0.5 if side > 0 else 1.0)
+            side = 1
+        else:
+            high, below, above = flow, value, above * (0.5 if side < 0 else 1.0)
+            side = -1
+    return speed
 
 
 class SpoolLaw(NamedTuple):
@@ -223,13 +238,13 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         breakaway = gap * bridge_stall(part, load)
         dry = gap * bridge_stall(part, SPOOL_DYNAMIC_FRICTION_SHARE * load)
         dynamic = eased = force * dry
-        load, viscous = SPOOL_DYNAMIC_FRICTION_SHARE * load, c.CS / (force * gap)
         unit, span = c.GQF * gap / c.AS, c.XFM - dry
-        speed = bridge_velocity(part, load, c.BRG, unit, viscous)
+        load, viscous = SPOOL_DYNAMIC_FRICTION_SHARE * load, c.CS * unit / (force * gap)
+        speed = unit * bridge_speed(part, load, viscous, c.BRG)
         if span > 0.0 and speed > 0.0:
-            quarter, half = dry / gap + 0.25 * span / gap, dry / gap + 0.5 * span / gap
-            at_quarter = bridge_velocity(part, load, quarter, unit, viscous)
-            at_half = bridge_velocity(part, load, half, unit, viscous)
+            quarter, half = (dry + 0.25 * span) / gap, (dry + 0.5 * span) / gap
+            at_quarter = unit * bridge_speed(part, load, viscous, quarter)
+            at_half = unit * bridge_speed(part, load, viscous, half)
             damping = force * span / (0.5 * speed + at_half)
             eased = force * c.XFM - damping * speed
             at_quarter = at_quarter * damping / (0.25 * force) - span

@@ -1,8 +1,8 @@
 """Streaming monitors: one sample a tick in, residuals and their cumulative sums out.
 
-`Monitor` follows a test. `FreeMotionMonitor` follows a unit between tests too: its sums of the
-pressure rest while the spool is so near to the middle that less than a converter step decides the
-pressure.
+`Monitor` follows a test. `FreeMotionMonitor` follows a unit between tests too: it leaves out
+the pressure while the spool is so near to its middle that less than a converter step of it decides
+the pressure.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ TICK_RANGE_S = (1e-5, 0.1)
 SPOOL_POSITION_PLACES = [
     monitor_memory.MODEL.state + row for row in (ROWS.spool, ROWS.wire, ROWS.spool_lagged)
 ]
-"""All that has the spool's position (`ehadiag.monitor.push_kernel.push_tick`)."""
+"""Places that hold the spool's position (`ehadiag.monitor.push_kernel.push_tick`)."""
 LOST_TICKS_PLACE = monitor_memory.MONITOR.command + monitor_memory.CommandMemory._fields.index(
     "lost"
 )
 STATE_PLACES = slice(monitor_memory.MONITOR.control, monitor_memory.MODEL.path)
-"""All that goes on from tick to tick."""
+"""Places of the state that goes on from tick to tick."""
 VISCOSITY_PLACE, SUPPLY_PLACE, CLOSED_PLACE = (
     monitor_memory.SEVERITY_COUNT + MonitorUnit._fields.index(name)
     for name in ("viscosity", "supply", "closed")
@@ -70,7 +70,7 @@ class Tick(NamedTuple):
 
 
 class Reading(msgspec.Struct, frozen=True, eq=False):
-    """What the monitor holds after a push; the arrays are its own and change with the next one."""
+    """Results of a push; the arrays are the monitor's own and change with the next push."""
 
     predicted: Array
     """Spool (m), pressure (Pa), position (m; from 0 at the start), shape (3,)."""
@@ -79,12 +79,12 @@ class Reading(msgspec.Struct, frozen=True, eq=False):
     sample is lost."""
     cusum: Array
     """Upper and lower sum (columns) of spool and pressure (rows), in units of noise; a sum that
-    gave alarm is back at 0."""
+    raised an alarm is back at 0."""
     alarmed: NDArray[np.bool_]
-    """Which sums gave alarm at this tick, shape (2, 2)."""
+    """Which sums raised an alarm at this tick, shape (2, 2)."""
 
     def copy(self) -> Reading:
-        """Return a reading that stays."""
+        """Return a copy that further pushes do not change."""
         return Reading(
             self.predicted.copy(), self.residual.copy(), self.cusum.copy(), self.alarmed.copy()
         )
@@ -105,14 +105,14 @@ class Monitor:
     environment : Environment | None
         Oil and supply; None: as the actuator's data say.
     mode : CommandMode
-        What commands are.
+        Whether commands are currents or positions.
     hours : float
         Mean time between false alarms of the monitor as a whole, on white noise, h.
     shift : float
-        Of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
+        Shift of the mean that the sums are designed to find soonest, in units of noise, 0.1 … 5.
     noise : tuple[float, float] | None
         Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22 on the
-        converters, finer ones than 12 bits counted as 12.
+        converters, of which finer ones than 12 bits count as 12 bits.
     offsets : tuple[float, float]
         Constant errors of spool (m) and pressure sensor (Pa).
     effects : Mapping[str, float] | None
@@ -153,9 +153,9 @@ class Monitor:
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
         self.constants: PlantConstants = constants
-        """Of the unit as new with its effects, at the oil and supply of the actuator's data."""
+        """Constants of the unit as new with its effects, at the oil and supply of its data."""
         self.noise: tuple[float, float] = noise
-        """Of spool (m) and pressure (Pa)."""
+        """Standard deviation of spool (m) and pressure (Pa)."""
         self._plan = monitor_plan(actuator, constants, self.design, noise, anchor, channels)
         closed = float(mode is CommandMode.POSITION)
         start = MonitorUnit(*offsets, 1.0, float(constants.PSR), closed)
@@ -172,16 +172,15 @@ class Monitor:
             _view(p[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.model].reshape(2, 2)),
             _view(self._alarmed),
         )
-        """What the last push left."""
+        """Reading of the last push."""
         self.push(Tick(0.0, 0.0, 0.0, 0.0, 0.0))
         self.reset()
 
     def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
         """Advance by one tick, a `Tick` or its five numbers; returns `reading`, always the same.
 
-        Call it for every tick: a tick that did not arrive is `Tick` of five NaN. To look at types
-        takes time that this call does not have: what `float` takes for a number, a text too, is
-        taken.
+        Call it for every tick: a tick that did not arrive is `Tick` of five NaN. Types are not
+        checked, which would cost time: whatever `float` converts is accepted, even a text.
 
         Parameters
         ----------
@@ -196,8 +195,7 @@ class Monitor:
         Raises
         ------
         TypeError
-            Not a tuple of five of these, or whatever a `__float__` raised; the monitor is as it
-            was.
+            The tick is not five numbers, or a `__float__` raised; the monitor is as it was.
         """
         try:
             alarms = self._push(self._address, *map(float, sample))
@@ -214,12 +212,12 @@ class Monitor:
 
     @property
     def mode(self) -> CommandMode:
-        """What commands are."""
+        """Whether commands are currents or positions."""
         closed = self._memory[monitor_memory.MONITOR_CLOSED] != 0.0
         return CommandMode.POSITION if closed else CommandMode.CURRENT
 
     def follow(self, mode: CommandMode) -> None:
-        """Take commands as of this mode from the next tick on; all else continues.
+        """Take commands in this mode from the next tick on; all else continues.
 
         The control law starts anew, as the flight-control computer's does.
         """
@@ -232,7 +230,7 @@ class Monitor:
         self._memory[LOST_TICKS_PLACE] = 1.0
 
     def tune(self, environment: Environment) -> None:
-        """Take this oil and supply from the next tick on; all else continues.
+        """Set oil and supply from the next tick on; all else continues.
 
         What the environment does not state is as the actuator's data say. A supply that is not
         above the return pressure raises ConfigurationError.
@@ -249,7 +247,7 @@ class Monitor:
         self._memory[STATE_PLACES] = state
 
     def push_block(self, samples: Array2) -> Array2:
-        """Advance by some ticks, rows as of `push`, as fast as the model can.
+        """Advance by a block of ticks, each row as of `push`, as fast as the model can.
 
         Returns spool (m), position (m) and current (A) of the model, and residuals of spool and
         pressure in units of noise, shape (n, 5).
@@ -263,12 +261,12 @@ class Monitor:
         self._memory[STATE_PLACES] = other._memory[STATE_PLACES]
 
     def nudge(self, spool: float) -> None:
-        """Move the modelled spool by some m, as re-anchoring does, and restart the sums."""
+        """Move the modelled spool by `spool` (m), as re-anchoring does, and restart the sums."""
         self._memory[SPOOL_POSITION_PLACES] += spool
         self._memory[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.model] = 0.0
 
     def reset(self, spool: float = 0.0) -> None:
-        """Restart from rest with the spool there (m), as a stored test begins."""
+        """Restart from rest with the spool at this position (m), as a stored test begins."""
         self._alarms, self._alarmed[:] = 0, False
         reset_monitor(self._address, spool)
 
@@ -313,9 +311,9 @@ def _view(array: NDArray[Scalar]) -> NDArray[Scalar]:
 UNDECIDED_SPOOL_STEPS = 3.0
 """Uncertainty of the modelled spool position, in converter steps."""
 SETTLING_TICKS = 300
-"""Ticks with a spool sample until alarms count, 1."""
+"""Ticks with a spool sample, after a reset or `settle`, from which on alarms count, 1."""
 PAUSE_TICKS = 5
-"""Ticks without pressure after the last undecided one, 1: the jack may still stick."""
+"""Ticks after the last undecided one that are left out too, 1: the jack may still stick."""
 
 
 class FreeMotionMonitor:
@@ -331,54 +329,52 @@ class FreeMotionMonitor:
         self, monitor: Monitor, undecided: float, offset: float = 0.0, travel: float = 0.0
     ) -> None:
         self.monitor = monitor
-        """What it pushes into."""
+        """The monitor that it pushes into."""
         self._undecided, self._offset, self._travel = undecided, offset, travel
-        self._places: deque[float] = deque(maxlen=SLIP_TICKS + 1)
-        self._resting = 0
-        self._age = 0
+        self._positions: deque[float] = deque(maxlen=SLIP_TICKS + 1)
+        self._pause_left = 0
+        self._settled_ticks = 0
 
     @property
     def settled(self) -> bool:
-        """Whether alarms count."""
-        return self._age >= SETTLING_TICKS
+        """Whether the modelled spool has settled on the measured one: alarms count."""
+        return self._settled_ticks >= SETTLING_TICKS
 
     def settle(self) -> None:
-        """Continue from the present state as from an uncertain one."""
-        self._age = 0
+        """Let the modelled spool settle again from its present state; till then no alarm counts."""
+        self._settled_ticks = 0
 
     def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
-        """Advance by one tick, see `Monitor.push`; residual of the pressure NaN where it is
-        undecided.
-        """
+        """Advance by one tick, see `Monitor.push`; an undecided pressure has the residual NaN."""
         command, current, spool, _, position = sample
         monitor, near = self.monitor, self._undecided
         if abs(spool - self._offset) < near or abs(monitor.reading.predicted[0]) < near:
-            self._resting = PAUSE_TICKS
+            self._pause_left = PAUSE_TICKS
         if self._travel > 0.0:
-            places = self._places
-            if math.isfinite(position):
-                places.append(position)
-            if len(places) <= SLIP_TICKS or abs(places[-1] - places[0]) < self._travel:
-                self._resting = PAUSE_TICKS
-        if self._resting:
-            self._resting -= 1
+            positions = self._positions
+            positions.append(position)
+            slides = abs(positions[-1] - positions[0]) >= self._travel  # not of a lost position
+            if len(positions) <= SLIP_TICKS or not slides:
+                self._pause_left = PAUSE_TICKS
+        if self._pause_left:
+            self._pause_left -= 1
             sample = command, current, spool, math.nan, position
         reading = monitor.push(sample)
-        if self._age < SETTLING_TICKS:
+        if self._settled_ticks < SETTLING_TICKS:
             residual = float(reading.residual[0])
             if math.isfinite(residual):
-                self._age += 1
-                monitor.nudge(residual * monitor.noise[0] / (self._age + 1))
+                self._settled_ticks += 1
+                monitor.nudge(residual * monitor.noise[0] / (self._settled_ticks + 1))
         return reading
 
     def follow(self, mode: CommandMode) -> None:
-        """Take commands as of this mode from the next tick on, see `Monitor.follow`."""
+        """Take commands in this mode from the next tick on, see `Monitor.follow`."""
         self.monitor.follow(mode)
 
     def reset(self, spool: float = 0.0) -> None:
-        """Restart from rest with the spool there (m)."""
-        self._resting, self._age = PAUSE_TICKS, 0
-        self._places.clear()
+        """Restart from rest with the spool at this position (m)."""
+        self._pause_left, self._settled_ticks = PAUSE_TICKS, 0
+        self._positions.clear()
         self.monitor.reset(spool)
 
 

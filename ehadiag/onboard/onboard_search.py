@@ -1,8 +1,8 @@
 """Search of the on-board identification: models side by side, grids, genetic search, noise.
 
-A pass advances seven models over windows of the recording, tick by tick, and may stop after any
-tick; what it adds up is in the memory. The jack's severity is searched with the jack alone, driven
-by the measured spool, as in `ehadiag.identify.staged_search`.
+A pass advances seven models over windows of the recording, tick by tick. It may stop after any
+tick: its sums are in the memory (`onboard_memory`). The jack's severity is searched with the jack
+alone, driven by the measured spool, as in `ehadiag.identify.staged_search`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from ehadiag.onboard.onboard_memory import (
 
 PLAN_SPOOL_WEIGHT = MONITOR_PLAN_SETTINGS + MonitorSettings._fields.index("spool_weight")
 PLAN_PRESSURE_WEIGHT = MONITOR_PLAN_SETTINGS + MonitorSettings._fields.index("pressure_weight")
-"""Where the plan has the reciprocal noise."""
+"""Places of the reciprocal noise in the plan."""
 ANCHOR_SMALL_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_small")
 ANCHOR_LARGE_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_large")
 HALVINGS_PLACE = MONITOR.settings + MonitorSettings._fields.index("halvings")
@@ -93,7 +93,7 @@ class OnboardSearchRules(NamedTuple):
     """Run-in before a window, s."""
     stds: tuple[float, ...] = (0.1, 0.4)
     """Standard deviations of a severity at the start of each genetic search, 1: those of the
-    package's further attempts."""
+    further attempts in `ehadiag.identify`."""
     generations: int = 40
     """Largest number of generations of each, 1."""
     virtual_population: float = 42.0
@@ -110,8 +110,8 @@ SEARCH = OnboardSearchRules()
 CENTRE_BEST, CENTRE_PLACE, CENTRE_LEFT, CENTRE_RIGHT, CENTRE_LAST, CENTRE_BEFORE = range(
     ONBOARD.centre + ONBOARD_GENES, ONBOARD.centre + ONBOARD_GENES + 6
 )
-"""Lowest cost of a grid, its place, its neighbours' costs, that of the last point, and whether that
-was the lowest."""
+"""Places of a grid's lowest cost, of the severity there, of the costs of the points before and
+behind it, of the cost of the last point, and of whether the last point had the lowest."""
 COSTS = ONBOARD.population + ONBOARD_MODELS * ONBOARD_GENES
 """Place of the costs of all models."""
 
@@ -137,7 +137,7 @@ def start_model(address: int, plan_address: int, plan: Array, lane: int, point: 
 
 @inlined_exact
 def identified_constants(plan_address: int, plan: Array) -> int:
-    """Address of the constants that a recording is identified with."""
+    """Address of the constants of the identification; behind the plan if exponents have a range."""
     if not verdict_rules_of(plan).exponents > 0.0:
         return plan_address
     behind = ONBOARD_PLAN_SIZE + int(plan[PLAN_DIRECTIONS]) * PLANT_FIELDS
@@ -163,7 +163,7 @@ def start_model_by(
 
 @inlined_exact
 def loosen_anchor(address: int, lane: int, factor: float) -> None:
-    """Widen what a model may be off before it is put back on the spool."""
+    """Multiply the spool errors beyond which a model is re-anchored; math.inf: it never is."""
     numbers = array_at(monitor_at(address, lane), (MONITOR_SIZE,))
     numbers[ANCHOR_SMALL_PLACE] *= factor
     numbers[ANCHOR_LARGE_PLACE] *= factor
@@ -283,7 +283,7 @@ def count_residual(p: Array, channel: int, now: float, before: float, earlier: f
 
 @inlined_exact
 def shown_noise(p: Array, channel: int) -> float:
-    """Noise that the second differences show, of which the largest 2 % are left out."""
+    """Noise, by the second differences without their largest 2 %, in units of the plan's."""
     total, seen, mean = 0.0, 0.0, 0.0
     first = ONBOARD.histograms + (2 + channel) * HISTOGRAM_BINS
     for i in range(HISTOGRAM_BINS):
@@ -303,18 +303,18 @@ def shown_noise(p: Array, channel: int) -> float:
 
 
 @inlined_exact
-def shown_excess(p: Array, channel: int, seconds: float) -> float:
+def shown_excess(p: Array, channel: int, differences: float) -> float:
     """Cost of the residuals over that of noise, see `ehadiag.identify.estimates.excess_cost`.
 
-    seconds: sum of their second differences, capped as in the histogram: where a converter's steps
-    make them lie beside the middles of their bins, the histogram's noise is off by a few percent.
+    differences: sum of the residuals' second differences, capped as in the histogram. It corrects
+    the histogram's noise, a few percent off where a converter's steps miss the bins' middles.
     """
     total, cost, binned = 0.0, 0.0, 0.0
     width = 2.0 * SEARCH.histogram_range / HISTOGRAM_BINS
     for i in range(HISTOGRAM_BINS):
         binned += p[ONBOARD.histograms + (2 + channel) * HISTOGRAM_BINS + i] * (i + 0.5)
     binned *= ROOT_OF_SIX * SEARCH.histogram_range / HISTOGRAM_BINS
-    scale = ESTIMATION.cauchy_scale * shown_noise(p, channel) * seconds / max(binned, 1.0)
+    scale = ESTIMATION.cauchy_scale * shown_noise(p, channel) * differences / max(binned, 1.0)
     if not scale > 0.0:
         return 1.0
     for i in range(HISTOGRAM_BINS):
@@ -327,7 +327,7 @@ def shown_excess(p: Array, channel: int, seconds: float) -> float:
 
 @inlined_exact
 def _median(p: Array, channel: int) -> float:
-    """Of the residuals, in units of the plan's noise."""
+    """Median of the residuals, in units of the plan's noise."""
     total, seen = 0.0, 0.0
     first = ONBOARD.histograms + channel * HISTOGRAM_BINS
     for i in range(HISTOGRAM_BINS):
@@ -352,7 +352,7 @@ def grid_point(p: Array, grid: int, index: int) -> float:
 
 @bare_kernel
 def start_grid(address: int, plan_address: int, plan: Array, grid: int, done: int) -> None:
-    """Prepare all models at points of a grid, of which so many passes are done."""
+    """Prepare all models at the next points of a grid; done: its passes so far."""
     p, trial = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.trial)
     severity = GRID_SEVERITIES[grid]
     if done == 0:
@@ -370,14 +370,14 @@ def start_grid(address: int, plan_address: int, plan: Array, grid: int, done: in
 
 @inlined_exact
 def begin_window(address: int, spool: float) -> None:
-    """Let all models begin with the spool there, m."""
+    """Restart all models from rest; spool: their spool's position, m."""
     for lane in range(ONBOARD_MODELS):
         reset_monitor(monitor_at(address, lane), spool)
 
 
 @inlined_exact
 def next_spool(ticks: Array, k: int, end: int, before: float) -> float:
-    """Spool at the end of a tick, as measured; on a straight line to the next sample where lost."""
+    """Spool at the end of a tick, as measured; a lost sample is interpolated to the next one."""
     ahead = k
     while ahead < end and not math.isfinite(ticks[ahead, 2]):
         ahead += 1
@@ -406,7 +406,7 @@ def drive_models(address: int, plan: Array, spool: float, before: float, pressur
 
 @bare_kernel
 def add_costs(address: int, spool_cap: float, pressure_cap: float) -> None:
-    """Add the squares of the models' residuals, capped, to their costs; a cap of 0 leaves out."""
+    """Add the squares of the models' residuals, capped, to their costs; no pressure at cap 0."""
     p = array_at(address, (ONBOARD.end,))
     for lane in range(ONBOARD_MODELS):
         at = ONBOARD.monitors + lane * MONITOR_SIZE + MONITOR.residual
@@ -418,7 +418,7 @@ def add_costs(address: int, spool_cap: float, pressure_cap: float) -> None:
 
 @bare_kernel
 def end_grid(address: int, grid: int, done: int) -> bool:
-    """Take the costs of a pass; whether the grid is at its end, and its vertex the best point."""
+    """Take the costs of a pass; True at the grid's end: a parabola's vertex is the new centre."""
     p = array_at(address, (ONBOARD.end,))
     for lane in range(ONBOARD_MODELS):
         cost = p[COSTS + lane]
@@ -479,7 +479,7 @@ def start_generation(
 
 @bare_kernel
 def end_generation(address: int, generation: int) -> bool:
-    """Learn from a generation; whether it was the last, and its elite is the best point."""
+    """Learn from a generation; True after the last one: its elite is now the best point."""
     p = array_at(address, (ONBOARD.end,))
     update_state(
         _search_state(address),
@@ -499,7 +499,7 @@ def end_generation(address: int, generation: int) -> bool:
 
 @bare_kernel
 def start_noise(address: int, plan_address: int, plan: Array) -> None:
-    """Prepare the first model, free, at the best point, to judge noise and offsets."""
+    """Prepare the first model at the best point, not re-anchored, to judge noise and offsets."""
     p = array_at(address, (ONBOARD.end,))
     start_model(address, plan_address, plan, 0, parameters_at(address, ONBOARD.point))
     loosen_anchor(address, 0, math.inf)
@@ -518,7 +518,7 @@ def end_noise(address: int, std: float) -> None:
 
 @inlined_exact
 def set_density(p: Array, std: float) -> None:
-    """Begin with a density of this deviation of each severity."""
+    """Set the refinement's density: each severity has this deviation, none is correlated."""
     for i in range(ONBOARD_GENES):
         for j in range(ONBOARD_GENES):
             p[ONBOARD.density + i * ONBOARD_GENES + j] = std if i == j else 0.0

@@ -29,17 +29,17 @@ class ForecastRules(msgspec.Struct, frozen=True):
     min_lives: int = 5
     """Number of lives that make a fleet."""
     min_growth_stds: float = 5.0
-    """Growth of the present life, in deviations of its noise; less carries no number."""
+    """Least growth in the present life, in deviations of its noise, that a forecast can use."""
     max_interval_ratio: float = 50.0
     """Ratio of the outer quantiles, 1; a wider interval is no number to plan with."""
     alarm_rate: float = 1e-3
-    """Share of the diagnoses of sound wear that raise an alarm, 1."""
+    """Share of the diagnoses of ordinary wear that raise a false alarm, 1."""
     tail_chance: float = 0.05
-    """Share of the surprises, 1, beyond which their tail is taken as exponential."""
+    """Share of the surprises (see `surprises`), 1, that form their tail, taken as exponential."""
     min_surprises: int = 40
-    """Number of surprises that a normal density stands for, where there are few."""
+    """Least number of surprises; draws of a normal density make up for missing ones."""
     min_fall: float = 0.02
-    """Net fall of a severity in a life beyond its noise, 1; from it on it is an alarm."""
+    """Net fall of a severity in a life, 1, above which it raises an alarm, if above its noise."""
 
 
 RULES = ForecastRules()
@@ -52,7 +52,7 @@ class RemainingLife(msgspec.Struct, frozen=True):
 
     level: float
     low: float | None
-    """From now, below 0 before it; 10 % quantile. None: no number."""
+    """10 % quantile, from now, negative in the past. None: no number."""
     median: float | None
     high: float | None
     """90 % quantile."""
@@ -84,19 +84,19 @@ class Forecast(msgspec.Struct, frozen=True):
     at: float | None
     """Hours, cycles or days of the unit at the last diagnosis; None without any."""
     value: float | None
-    """The severity then."""
+    """Severity at the last diagnosis."""
     diagnoses: int
-    """Of the present life."""
+    """Number of diagnoses in the present life."""
     fleet: int
-    """Lives of other units, and earlier ones of this, that the wear was learnt from."""
+    """Number of lives, of other units or earlier ones of this, that the wear was learnt from."""
     process: str | None
     """Law of the highest weight; None without a number."""
     weights: dict[str, float]
-    """Of each law, for the last level; empty without a number."""
+    """Weight of each law, for the last level; empty without a number."""
     remaining: tuple[RemainingLife, ...]
     """One for each level."""
     note: str
-    """What is extrapolated; empty where lives were seen that far."""
+    """Which levels are extrapolated; empty: lives were seen to reach all of them."""
     alarm: str
     """A change that no wear explains; empty where there is none."""
     elapsed: float = 0.0
@@ -120,9 +120,9 @@ def forecast(
     """Forecast one severity of one unit.
 
     unit: `hours`, `cycles` or `days`; life: the present one; fleet: what other lives say; levels:
-    that are to be reached; seed: of the draws; the same seed gives the same digits; elapsed: hours,
-    cycles or days since the last diagnosis; nobody knows what was reached in them. Returns a number
-    for each level, or why there is none.
+    severities whose times are asked for; seed: of the draws; the same seed gives the same digits;
+    elapsed: hours, cycles or days since the last diagnosis, in which the level may have been
+    reached. Returns a number for each level, or why there is none.
     """
     found = Forecast(
         name=name,
@@ -163,7 +163,7 @@ def forecast(
 def _remaining(
     quantiles: NDArray[np.float64], level: float, elapsed: float, unit: str
 ) -> RemainingLife:
-    """Number of a passage, a time after the diagnosis that it is forecast from."""
+    """Interval of a passage; quantiles: from the last diagnosis, `elapsed` before now."""
     low, median, high = (float(np.interp(q, CHANCES, quantiles)) for q in INTERVAL_CHANCES)
     if not math.isfinite(high):
         why = "the wear that was seen need not ever reach this level"
@@ -176,7 +176,7 @@ def _remaining(
 
 
 def _no_numbers(life: Life, levels: Sequence[float], why: str) -> tuple[RemainingLife, ...]:
-    """No number, but for levels that are reached already."""
+    """Return 0 for each level that is reached already, and no number for the others."""
     return tuple(
         RemainingLife(level, 0.0, 0.0, 0.0, "")
         if len(life.age) and life.value[-1] >= level
@@ -186,7 +186,7 @@ def _no_numbers(life: Life, levels: Sequence[float], why: str) -> tuple[Remainin
 
 
 def _needed(lives: int) -> int:
-    """Number of diagnoses that a number needs beside a fleet of so many lives."""
+    """Number of diagnoses that a forecast needs with so many lives in the fleet."""
     return RULES.min_diagnoses - (lives >= RULES.min_lives)
 
 
@@ -226,7 +226,7 @@ def _fall(life: Life, unit: str) -> str:
 
 
 def _surprise(own: OwnLife, fleet: Fleet, unit: str) -> str:
-    """Name the change that was expected least, if sound wear makes such a one too rarely."""
+    """Name the least expected change, if ordinary wear hardly ever makes one as unexpected."""
     life, (mine, others) = own.life, surprises(own, fleet)
     worst = int(np.argmax(np.abs(mine)))
     rest = np.abs(np.r_[np.delete(mine, worst), others])
@@ -244,6 +244,6 @@ def _surprise(own: OwnLife, fleet: Fleet, unit: str) -> str:
     if change < 0.0:
         return f"{what} {unit}: {NOTE_NO_WEAR}"
     return (
-        f"{what} {unit}: {abs(mine[worst]):.0f} deviations from what was expected, sound wear stays"
-        f" within {bound:.0f} in {1.0 - RULES.alarm_rate:.1%} of diagnoses"
+        f"{what} {unit}: {abs(mine[worst]):.0f} deviations from what was expected, ordinary wear"
+        f" stays within {bound:.0f} in {1.0 - RULES.alarm_rate:.1%} of diagnoses"
     )

@@ -377,7 +377,7 @@ class BusMonitor:
         channels = stated_channels(self._map.stated, actuator)
         calibration = actuator.calibration
         # What the model leaves of the unit as new is none of its changes.
-        share = 1.0 if calibration is None else 1.0 + calibration.fit.left
+        share = 1.0 if calibration is None else math.sqrt(1.0 + calibration.fit.left)
         least = default_noise(channels)
         measured = self.unit.noise or least
         monitor = Monitor(

@@ -1,5 +1,5 @@
 /* UDS over ISO-TP (docs/reference/uds.md): starts, stops and watches the node's tests in place of
- * `BitRequest` and `BitStatus`, and answers what the computer has found itself.
+ * `BitRequest` and `BitStatus`, and answers with the computer's own result.
  *
  *     fcc_uds_take(&uds, &frame);                  each frame of the bus
  *     count = fcc_uds_tick(&uds, &node, frames);   once per tick, before fcc_node_begin()
@@ -20,7 +20,7 @@
 
 enum { FCC_FOUND_NOTHING = 0, FCC_FOUND_DONE = 3 };
 
-/* What the computer has found itself in its last test; the caller keeps it up to date. */
+/* The computer's own result of its last test; the caller keeps it up to date. */
 struct fcc_found {
     uint8_t state;   /* OnboardState (BUS-17) */
     uint8_t verdict; /* 0, 10, 20, 30 (BUS-18) */

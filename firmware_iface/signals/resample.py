@@ -2,11 +2,11 @@
 
 A signal that a logger took from the computer's bus *holds* each value for a tick: its changes show
 the ticks of the computer, whatever clock the logger has, and each value is taken as it is. A
-signal that was measured by itself is read near the end of each tick, where the computer's
-converters sample: at the instant at which it was sampled mostly, by a cubic through two samples on
-either side; of many samples in a tick the mean of those within a sixteenth of a tick about the end,
-against what is faster; of less than three in four ticks the nearest tick gets each, and the others
-none.
+signal that was measured apart from the bus is read near the end of each tick, where the computer's
+converters sample: by a cubic through two samples on either side, as long before the end as the
+signal's own samples usually lie. Of many samples in a tick, those within a sixteenth of a tick
+about its end are averaged, which removes faster oscillations. With fewer than three samples in four
+ticks, each sample goes to the nearest tick, and the other ticks have none.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from firmware_iface.recording import (
 
 
 class HeldLimits(msgspec.Struct, frozen=True):
-    """Limits by which a signal holds its values for a tick, and its changes are counted."""
+    """Limits that tell which signals hold values for a tick, and in which tick each change is."""
 
     changes_per_tick: float = 1.1
-    """Most changes a tick, where there are most."""
+    """Largest number of changes a tick, in the span with the most."""
     span: int = 50
     """Ticks in which the changes are counted."""
     recent: int = 300
-    """Changes whose least delay is that of the present ones."""
+    """Number of latest changes whose least delay is taken for the present one."""
     early: float = 0.15
-    """Ticks by which a change may be earlier than those."""
+    """Ticks by which a change may come earlier than after this delay."""
     group: int = 3
-    """Channels that change together from which on a tick without a change is a lost one."""
+    """Number of channels, changing together, from which a tick without a change was lost."""
     rate: float = 1.5
-    """Samples a tick from which on a signal can show that it holds its values."""
+    """Least samples a tick that can show whether a signal holds its values."""
     changes: int = 200
-    """Least changes of a signal that shows it."""
+    """Least changes that can show it."""
 
 
 HELD = HeldLimits()
@@ -54,7 +54,7 @@ class TickClock(msgspec.Struct, frozen=True, eq=False):
     """Beginnings of control ticks on the logger's clock."""
 
     begin: FloatArray
-    """Of each tick and of the one after the last, s, shape (ticks + 1,)."""
+    """Beginning of each tick and of the one after the last, s, shape (ticks + 1,)."""
 
     @property
     def ticks(self) -> int:
@@ -70,7 +70,7 @@ class TickClock(msgspec.Struct, frozen=True, eq=False):
 def is_held(signal: RecordedSignal, period: float) -> bool:
     """Whether a signal keeps each value for a whole tick, as one taken from a bus does.
 
-    period: length of a tick, s. Returns False of one that is sampled too seldom to show it.
+    period: length of a tick, s. Returns False where samples are too rare to show it.
     """
     if period / sampling_interval(signal) < HELD.rate:
         return False
@@ -93,28 +93,28 @@ def held_on_ticks(
 
     signals: by role; period: nominal length of a tick, s. Returns the computer's clock on the
     logger's, and values by role, shape (ticks,): NaN in ticks in which none of several channels
-    that change together has changed; None where no signal holds its values, or changes come too
-    late to be told by their order alone.
+    that change together has changed; None: no signal holds its values, or the delays of the changes
+    scatter too much for their order alone to tell the ticks.
     """
     held = {role: item for role, item in signals.items() if is_held(item, period)}
     if not held:
         return None
     groups = groups_of(held, period)
-    lead = groups[0]
-    tick = _tick_sequence((lead.at - lead.at[0]) / period)
-    rate = float(np.polyfit(tick, lead.at, 1)[0])
-    step = max(sampling_interval(held[role]) for role in lead.roles)
-    if _scatter(lead.at - rate * tick) > step + HELD.early * period:
+    leader = groups[0]
+    tick = _tick_sequence((leader.at - leader.at[0]) / period)
+    rate = float(np.polyfit(tick, leader.at, 1)[0])
+    step = max(sampling_interval(held[role]) for role in leader.roles)
+    if _scatter(leader.at - rate * tick) > step + HELD.early * period:
         return None
     last = max(item.time[-1] for item in held.values())
-    after = max(int((last - lead.at[-1]) / rate), 0)
+    after = max(int((last - leader.at[-1]) / rate), 0)
     grid = np.arange(int(tick[-1]) + after + 2)
     known = np.append(tick, tick[-1] + after + 2)
-    times = np.append(lead.at, lead.at[-1] + (after + 2) * rate)
+    times = np.append(leader.at, leader.at[-1] + (after + 2) * rate)
     clock = TickClock(np.asarray(np.interp(grid, known, times), dtype=np.float64))
     rows: dict[str, FloatArray] = {}
     for group in groups:
-        place = _group_ticks(group, lead, tick)
+        place = _group_ticks(group, leader, tick)
         for role in group.roles:
             item = held[role]
             value = group.on_ticks(item, place, clock.ticks)
@@ -131,12 +131,12 @@ class SignalGroup(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def command(self) -> bool:
-        """Whether it is a command: that comes before the telemetry of its tick."""
+        """Whether it is a command, which comes before the telemetry of its tick."""
         return self.roles[0].startswith("command.")
 
     @property
     def complete(self) -> bool:
-        """Whether a tick without a change is one that did not arrive rather than an equal value."""
+        """Whether a tick without a change was lost; in other groups it has the same value again."""
         return len(self.roles) >= HELD.group
 
     def values(self, signal: RecordedSignal) -> FloatArray:
@@ -188,35 +188,35 @@ def _scatter(values: FloatArray) -> float:
 
 
 def _tick_sequence(since: FloatArray) -> IntArray:
-    """Ticks of changes that follow one another: each is of a tick of its own.
+    """Ticks of successive changes, each of a tick of its own; since: times of the changes, ticks.
 
-    A change comes up to a sampling interval late. The earliest of late tell how late the present
-    ones are at least; a logger with another clock makes that wander.
+    A change is sampled up to a sampling interval late. The least delay of the recent changes is
+    taken for the present one: it drifts, for the logger has another clock.
     """
     tick = np.zeros(len(since), dtype=np.int64)
     recent: deque[float] = deque([0.0], HELD.recent)
-    edge = 0.0
+    least_delay = 0.0
     for index in range(1, len(since)):
         at = float(since[index])
-        tick[index] = max(int(tick[index - 1]) + 1, math.floor(at - edge + HELD.early))
-        gone = recent[0] if len(recent) == HELD.recent else math.inf
+        tick[index] = max(int(tick[index - 1]) + 1, math.floor(at - least_delay + HELD.early))
+        dropped = recent[0] if len(recent) == HELD.recent else math.inf
         recent.append(at - float(tick[index]))
-        edge = min(recent) if gone <= edge else min(edge, recent[-1])
+        least_delay = min(recent) if dropped <= least_delay else min(least_delay, recent[-1])
     return tick
 
 
-def _group_ticks(group: SignalGroup, lead: SignalGroup, tick: IntArray) -> IntArray:
-    """Ticks of a group's changes: a command's is that of the telemetry that follows it."""
-    if group is lead:
+def _group_ticks(group: SignalGroup, leader: SignalGroup, tick: IntArray) -> IntArray:
+    """Ticks of a group's changes; a command has the tick of the telemetry that follows it."""
+    if group is leader:
         return tick
-    after = np.searchsorted(lead.at, group.at)
-    if group.command and not lead.command:
+    after = np.searchsorted(leader.at, group.at)
+    if group.command and not leader.command:
         later = np.append(tick, tick[-1] + 1)
-        # Between two changes that are far apart the command may be of any tick there.
-        back = np.append(lead.at, np.inf)[after] - group.at
-        period = float(np.median(np.diff(lead.at)))
-        return later[after] - np.where(np.isfinite(back), np.floor(back / period), 0).astype(int)
-    part = np.interp(group.at, lead.at, tick)
+        # Where telemetry changed ticks later, the command's tick is as many before that change.
+        wait = np.append(leader.at, np.inf)[after] - group.at
+        period = float(np.median(np.diff(leader.at)))
+        return later[after] - np.where(np.isfinite(wait), np.floor(wait / period), 0).astype(int)
+    part = np.interp(group.at, leader.at, tick)
     phase = np.angle(np.mean(np.exp(2j * np.pi * part))) / (2.0 * np.pi)
     return np.rint(part - phase).astype(np.int64)
 
@@ -226,8 +226,8 @@ def on_ticks(
 ) -> tuple[FloatArray, str]:
     """Values of a signal on each tick, and the rule by which they came.
 
-    period: length of a tick, s; hold: take the value in the middle of a tick, not that at its end:
-    of what the computer holds; lead: time before the ticks' ends whose values are taken, s. Returns
+    period: length of a tick, s; hold: take the value in the middle of a tick, not at its end, for
+    the computer holds it; lead: time before the ticks' ends whose values are taken, s. Returns
     NaN where there is none, shape (ticks,); the rule in words, with its error.
     """
     step = sampling_interval(signal)
@@ -240,10 +240,10 @@ def on_ticks(
 
 
 def usual_lead(signal: RecordedSignal, clock: TickClock, period: float) -> float:
-    """Time before the ticks' ends at which a signal was sampled mostly, s.
+    """Usual time between a signal's last sample in a tick and the tick's end, s.
 
-    period: length of a tick, s. Returns less than a sampling interval; 0 of so many samples that
-    their mean is taken, and of so few that each goes to the nearest tick.
+    period: length of a tick, s. Returns less than a sampling interval; 0 where samples are so many
+    that their mean is taken, or so few that each goes to the nearest tick.
     """
     step = sampling_interval(signal)
     if not SAMPLING.nearest <= period / step < SAMPLING.averaged:
@@ -256,7 +256,7 @@ def usual_lead(signal: RecordedSignal, clock: TickClock, period: float) -> float
 
 
 def _held_at(signal: RecordedSignal, middle: FloatArray, period: float, most: float) -> FloatArray:
-    """Value in the tick about each middle: its sample next to it, else the last one before."""
+    """Value of each tick: its sample next to the middle, else the last sample before."""
     time = signal.time
     before = np.searchsorted(time, middle, side="right") - 1
     known = before >= 0

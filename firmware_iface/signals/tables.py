@@ -36,29 +36,29 @@ from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, mi
 
 
 class EvenClockLimits(msgspec.Struct, frozen=True):
-    """Limits by which stamps are replaced by an even clock."""
+    """Limits that tell whether stamps are replaced by an even clock."""
 
     block: int = 200
-    """Rows whose median shows whether the stamps keep to one line."""
+    """Rows in a block; the medians of the blocks show whether the stamps keep to one line."""
     blocks: int = 5
-    """Least such blocks."""
+    """Least number of blocks."""
     scatter: float = 0.02
-    """Standard deviation of stamps that are not the clock's own, of an interval."""
+    """Least standard deviation of stamps that are replaced, in intervals."""
     offset: float = 0.5
-    """Intervals by which blocks may be off the line: a missing row makes one."""
+    """Range of the blocks' medians that is allowed, in intervals: one missing row shifts by 1."""
     deviation: float = 6.0
-    """Standard deviations of a block's median by which it may be off."""
+    """The same in standard deviations of a median; the larger range is allowed."""
 
 
 EVEN_CLOCK = EvenClockLimits()
 
 
 def even_times(time: FloatArray) -> tuple[FloatArray, float]:
-    """Replace stamps that scatter about even ones by these.
+    """Replace stamps that scatter about an even clock by the clock's times.
 
     time: stamps in the order of the rows, s, shape (n,). Returns times, shape (n,), and the
-    deviation of the stamps from them, s; the stamps as they are and 0 where they are even already,
-    or do not keep to one line: where rows are missing or each row has an instant of its own.
+    deviation of the stamps from them, s. Returns the stamps as they are and 0 where they are even
+    already, or keep to no line: rows are missing, or each row has an instant of its own.
     """
     blocks = len(time) // EVEN_CLOCK.block
     if blocks < EVEN_CLOCK.blocks or not np.isfinite(time).all():
@@ -83,9 +83,9 @@ def even_times(time: FloatArray) -> tuple[FloatArray, float]:
 DELIMITERS = ";\t,"
 MIN_TABLE_ROWS = 10
 MAX_TABLE_ROWS = 800_000
-"""Of a table, which is held at once in some 300 MB: 13 minutes at 1 kHz, 40 s at 20 kHz."""
+"""Most rows of a table, all held at once in some 300 MB: 13 minutes at 1 kHz, 40 s at 20 kHz."""
 MAX_TABLE_CELLS = 10_000_000
-"""Of a Parquet file, of which all columns are unpacked."""
+"""Most values of a Parquet file, of which all columns are unpacked."""
 DATE_RESOLUTIONS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Resolutions in which pandas holds dates."""
 
@@ -94,7 +94,7 @@ class SignalReader(Protocol):
     """Reads the decoded signals of one kind of log; made without arguments, one for each file.
 
     It may be the class of an entry point of `ehadiag.log_readers`, as `LogReader` of
-    `firmware_iface.logs.log_files` is for frames; that says what `signature` is.
+    `firmware_iface.logs.log_files` is for frames; `LogReader` describes `signature`.
     """
 
     signature: bytes
@@ -102,7 +102,7 @@ class SignalReader(Protocol):
     def signals(
         self, path: Path, columns: ColumnMap, budget: Budget, *, complete: bool
     ) -> dict[str, RecordedSignal]:
-        """Read the signals that have a role; `table_signals` does the most of it.
+        """Read the signals that have a role; `table_signals` does most of this for a table.
 
         path: the file, unpacked already; it exists and is not empty; budget: bytes and rows that
         reading may cost; complete: all channels must be in this one file. Returns by role, SI.
@@ -117,7 +117,7 @@ def read_signals(
     path: CSV, Parquet or MF4; packed by gzip too; columns: which column is what; budget: bytes and
     rows that reading may cost; complete: all channels must be in this one file. Returns by role,
     SI. InputOutputError: missing, unreadable, too large, without a library, without numbers;
-    ConfigurationError: a mapped column is missing, a unit is none of its quantity.
+    ConfigurationError: a mapped column is missing, a unit does not fit its quantity.
     """
     path = Path(path)
     size = log_size(path)
@@ -159,7 +159,7 @@ class ParquetReader:
             import pyarrow.parquet  # noqa: PLC0415 - optional, and slow
 
             about = pyarrow.parquet.read_metadata(path)
-            # What the file says of itself, before any of it is unpacked.
+            # The metadata state the size before anything is unpacked.
             cells = about.num_rows * about.num_columns
             if about.num_rows > MAX_TABLE_ROWS or cells > MAX_TABLE_CELLS:
                 raise _too_long(path)
@@ -179,7 +179,7 @@ class ParquetReader:
 
 
 def _plain_columns(about: Any) -> list[str]:
-    """Columns of numbers, one in each row: a text of any length takes a few bytes of a file."""
+    """Columns of plain numbers; a text column of a few bytes may unpack to any size."""
     schema = about.schema
     columns = (schema.column(index) for index in range(about.num_columns))
     return [
@@ -240,8 +240,8 @@ def _read_csv(
         )
     decimal = "," if delimiter != "," and "," in lines[-1] else "."
     try:
-        # pandas warns of rows longer than the header, and of columns of mixed kinds: both are told
-        # by what is missing afterwards.
+        # pandas warns of rows longer than the header, and of columns of mixed kinds: both show
+        # by missing values afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             table = pandas.read_csv(
@@ -295,7 +295,7 @@ def table_signals(
     table: a data frame of pandas, with the columns that are needed at least; units: units that the
     file gives, by column; present: names of all columns of the file; path: file, for errors;
     complete: all channels must be there. Returns by role, SI. InputOutputError: without numbers, or
-    time stamps; ConfigurationError: a mapped column is missing, a unit is none of its quantity.
+    time stamps; ConfigurationError: a mapped column is missing, a unit does not fit its quantity.
     """
     import pandas  # noqa: PLC0415 - read by now
 
@@ -340,7 +340,7 @@ def _seconds(series: Any) -> FloatArray | None:
     if kinds.is_object_dtype(series) or kinds.is_string_dtype(series):
         if np.isfinite(np.asarray(pandas.to_numeric(series, errors="coerce"), np.float64)).any():
             return None
-        text = series.astype("string").str.replace(",", ".")  # of decimals
+        text = series.astype("string").str.replace(",", ".")  # decimal comma
         series = pandas.to_datetime(text, format="ISO8601", errors="coerce", utc=True)
     if kinds.is_datetime64_any_dtype(series):
         series = series.dt.tz_convert(None) if series.dt.tz is not None else series
@@ -355,7 +355,7 @@ def _seconds(series: Any) -> FloatArray | None:
 def checked_signals(
     found: Iterable[tuple[str, tuple[FloatArray, FloatArray]]], path: Path
 ) -> dict[str, RecordedSignal]:
-    """Put signals in order of time, once for each instant, numbers alone.
+    """Sort samples by time, and keep one of each instant, if a number.
 
     found: role, time stamps (s) and values (SI) of each; path: file, for errors. Returns by role.
     InputOutputError: too few numbers of a channel.

@@ -1,6 +1,6 @@
-"""A tester's side of UDS: requests of a built-in test, and what the computer answers.
+"""A tester's side of UDS: requests of a built-in test, answers of the flight-control computer.
 
-It has neither bus nor clock: the session hands it frames and the time, and sends what is due.
+It has no bus and no clock: `firmware_iface.tester` passes it frames and the time, sends its frames.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ except ImportError:
     ) from None
 
 LOGGER = logging.getLogger(__name__)
-LOGGER.addHandler(logging.NullHandler())  # damaged messages are no lines on standard error
+LOGGER.addHandler(logging.NullHandler())  # keeps damaged messages off standard error
 PADDING = 0xCC
 """Byte that fills up a frame of 8 bytes (ISO 15765-2)."""
 MAX_MESSAGE_BYTES = 1024
-"""Longest message that is received; the longest of the computer's has some 30 bytes."""
+"""Longest message that is received; the computer's longest answer has some 30 bytes."""
 
 
 class IsoTpLink:
     """Carries messages in frames of one identifier each way (ISO 15765-2), padded to 8 bytes.
 
-    send_id: identifier of the frames that go out; receive_id: of those that come; above 0x7FF they
-    have 29 bits.
+    send_id: identifier of the frames sent; receive_id: of the frames received; if one is above
+    0x7FF, both have 29 bits.
     """
 
     def __init__(self, send_id: int, receive_id: int) -> None:
@@ -80,7 +80,7 @@ class IsoTpLink:
             rxfn=lambda _: self._received.popleft() if self._received else None,
             txfn=self._send_frame,
             address=isotp.Address(mode, txid=send_id, rxid=receive_id),
-            error_handler=lambda _: None,  # a message that is damaged or cut off does not come
+            error_handler=lambda _: None,  # a damaged or cut-off message is dropped
             params={
                 "tx_padding": PADDING,
                 "max_frame_size": MAX_MESSAGE_BYTES,
@@ -91,7 +91,7 @@ class IsoTpLink:
         self._receive_id = receive_id
 
     def take(self, frame: Frame) -> bool:
-        """Take a frame, or say that it is none of this link."""
+        """Take a frame of the receive identifier; return False for any other."""
         if (frame.can_id, frame.extended) != (self._receive_id, self._extended):
             return False
         if not (frame.error or frame.remote or frame.fd):
@@ -102,17 +102,17 @@ class IsoTpLink:
         return True
 
     def send(self, payload: bytes) -> None:
-        """Send a message, by the frames that `frames` returns."""
+        """Queue a message; `frames` returns its frames."""
         self._layer.send(payload)
 
     def frames(self) -> list[Frame]:
-        """Go on, and return the frames that are to be sent now, without time stamps."""
+        """Advance the transport, and return the frames to send now, without time stamps."""
         self._layer.process()
         sent, self._sent = self._sent, []
         return sent
 
     def message(self) -> bytes | None:
-        """Return the next message that came; None where none is whole."""
+        """Return the next message that arrived whole; None: there is none yet."""
         self._layer.process()
         payload = self._layer.recv()
         return None if payload is None else bytes(payload)
@@ -124,30 +124,30 @@ class IsoTpLink:
 
 
 POLL_PERIOD_NS = 20_000_000
-"""Between two requests of the routine's results: as often as a status comes (BUS-4)."""
+"""Time between requests of the routine's results: the period of `BitStatus` (BUS-4)."""
 RESPONSE_LIMIT_NS, MAX_RESPONSE_LIMIT_NS = 150_000_000, 1_000_000_000
-"""Longest wait for an answer: 50 ms of the computer (P2 of ISO 14229-2), and twice that; twice as
-long after each that did not come, up to the second one."""
+"""First and largest limit of the wait for an answer: 50 ms for the computer (P2 of ISO 14229-2) and
+100 ms of reserve; each answer that does not come doubles the limit."""
 PENDING_LIMIT_NS = 5_000_000_000
-"""Longest wait after `RESPONSE_PENDING` (P2* of ISO 14229-2)."""
+"""Longest wait for the answer after `RESPONSE_PENDING` (P2* of ISO 14229-2)."""
 ONBOARD_PERIOD_NS = 100_000_000
-"""Between two requests of the computer's own result while it identifies."""
+"""Time between requests of the computer's own result while it identifies."""
 MAX_ATTEMPTS = 3
-"""Times that identification data are requested without an answer."""
+"""Requests of one record without an answer, 1, after which it is left out."""
 
 REFUSAL_REASONS: dict[int, BitReason] = {REFUSALS[reason]: reason for reason in REFUSALS}
 REFUSAL_REASONS[ResponseCode.CONDITIONS_NOT_CORRECT] = BitReason.NONE
-"""What a negative response to a start says; with none the routine's results are asked."""
+"""Reason behind a negative response to a start; NONE: the routine's results state the reason."""
 BUSY_ONBOARD = (OnboardState.RECORDING, OnboardState.IDENTIFYING)
 
 
 class _Exchange(msgspec.Struct, frozen=True):
-    """A request, and what it expects."""
+    """A request, and the answer that it expects; not_before: earliest time to send it, ns."""
 
     service: ServiceId
     payload: bytes
     echo: bytes = b""
-    """First bytes of the positive answer behind its service."""
+    """First bytes of the positive answer after its service identifier."""
     action: RoutineAction | None = None
     record: DataRecord | None = None
     attempts: int = 1
@@ -155,14 +155,14 @@ class _Exchange(msgspec.Struct, frozen=True):
 
 
 class UdsClient:
-    """Requests a test by 0x31 and watches it by its results; one request at a time.
+    """Requests a test by RoutineControl (0x31) and polls its results; one request at a time.
 
-    Stops do not wait for an answer that is due. Any frame on the request identifier that comes from
-    the bus is another tester's.
+    A stop is sent at once, though an answer is still due. Any frame on the request identifier that
+    comes from the bus is another tester's.
 
-    second_sender: what gives away that somebody else answers as the computer does; empty if
-    nothing; pending: the last frame said that the whole answer to the start takes longer; notes:
-    identification data of the computer after a test, one sentence each.
+    second_sender: evidence that another node answers in the computer's place; empty if there is
+    none; pending: the last frame postponed the answer to the start; notes: identification data of
+    the computer after a test, one sentence each.
     """
 
     second_sender: str
@@ -175,7 +175,7 @@ class UdsClient:
         self._queue: deque[_Exchange] = deque()
         self._open: _Exchange | None = None
         self._open_until = 0
-        self._limit = RESPONSE_LIMIT_NS
+        self._answer_limit = RESPONSE_LIMIT_NS
         self._next_poll = 0
         self._polls = True
         self._started = False
@@ -184,13 +184,13 @@ class UdsClient:
         self._test_id = 0
         self._last_answer = b""
         self._unsolicited = 0
-        self._late = 0
+        self._given_up = 0
         self._onboard: OnboardResult | None = None
         self._facts: dict[str, str] = {}
         self.second_sender, self.pending, self.notes = "", False, ()
 
     def request(self, action: HandshakeAction, test_id: int, now: int) -> Sequence[Frame]:
-        """Return the frames that request something of a test; a start waits for its turn."""
+        """Return the frames that stop a test; a start waits for its turn in `due`."""
         option = b""
         if action is HandshakeAction.START:
             self._test_id = test_id
@@ -199,31 +199,31 @@ class UdsClient:
             return ()
         self._queue.clear()
         self._start_unanswered, self._refused = False, None
-        self._late += self._open is not None
+        self._given_up += self._open is not None
         self._send(_routine(RoutineAction.STOP), now)
         return self._link.frames()
 
     def take(self, frame: Frame, now: int) -> list[BitStatus | BitRequest]:
-        """Take a frame of the bus, and return what it says of the test."""
+        """Take a frame of the bus, and return the statuses and requests of a test in it."""
         ids, self.pending = self._identifiers, False
         if (frame.can_id, frame.extended) == (ids.request_id, ids.extended):
             return [BitRequest("", 0)]
         found: list[BitStatus | BitRequest] = []
         if self._link.take(frame):
-            self._open_until = max(self._open_until, now + self._limit)
+            self._open_until = max(self._open_until, now + self._answer_limit)
             while (payload := self._link.message()) is not None:
                 found += self._answered(payload, now)
         return found
 
     def due(self, now: int) -> Sequence[Frame]:
         """Return the frames to send now; to be called after each frame and when time passes."""
-        lost = self._open
-        if lost is not None and now >= self._open_until:
-            self._open, self._late = None, self._late + 1
-            # An answer that is slow must not be cut off by the next request, again and again.
-            self._limit = min(2 * self._limit, MAX_RESPONSE_LIMIT_NS)
-            if lost.action is None and lost.attempts < MAX_ATTEMPTS:
-                self._queue.append(replace(lost, attempts=lost.attempts + 1))
+        unanswered = self._open
+        if unanswered is not None and now >= self._open_until:
+            self._open, self._given_up = None, self._given_up + 1
+            # Else each answer of a slow computer would be cut off by the next request.
+            self._answer_limit = min(2 * self._answer_limit, MAX_RESPONSE_LIMIT_NS)
+            if unanswered.action is None and unanswered.attempts < MAX_ATTEMPTS:
+                self._queue.append(replace(unanswered, attempts=unanswered.attempts + 1))
         if self._open is None:
             if self._queue and now >= self._queue[0].not_before:
                 self._send(self._queue.popleft(), now)
@@ -233,7 +233,7 @@ class UdsClient:
         return self._link.frames()
 
     def request_results(self) -> None:
-        """Ask what the computer has found itself, who it is, and its trouble codes."""
+        """Queue requests of the computer's own result, sensor offsets, identity, trouble codes."""
         self._polls = False
         self._queue.clear()
         self._queue.extend(_data(item) for item in (ONBOARD, OFFSETS, SERIAL, SOFTWARE))
@@ -248,11 +248,11 @@ class UdsClient:
 
     @property
     def awaited(self) -> bool:
-        """Whether an answer on the computer's own result is still to come."""
+        """Whether a request still waits for its turn or its answer."""
         return bool(self._queue) or self._open is not None
 
     def onboard(self, test_id: int | None) -> OnboardResult | None:
-        """Return what the computer has found itself in a test; None: nothing."""
+        """Return the computer's own result of a test; None: there is none."""
         found = self._onboard
         return found if found is not None and found.is_of(test_id) else None
 
@@ -264,11 +264,11 @@ class UdsClient:
     def _send(self, exchange: _Exchange, now: int) -> None:
         if exchange.action is RoutineAction.START:
             self._started = self._start_unanswered = True
-        self._open, self._open_until = exchange, now + self._limit
+        self._open, self._open_until = exchange, now + self._answer_limit
         self._link.send(exchange.payload)
 
     def _answered(self, payload: bytes, now: int) -> list[BitStatus | BitRequest]:
-        """Take a message of the computer."""
+        """Take an answer of the computer, and return the statuses of the test in it."""
         exchange = self._open
         response = Response.from_payload(payload)
         repeated, self._last_answer = payload == self._last_answer, payload
@@ -281,7 +281,7 @@ class UdsClient:
             self._open_until = now + PENDING_LIMIT_NS
             self.pending = exchange.action is RoutineAction.START
             return []
-        self._open, self._limit = None, RESPONSE_LIMIT_NS
+        self._open, self._answer_limit = None, RESPONSE_LIMIT_NS
         data = (response.data or b"")[len(exchange.echo) :]
         if exchange.action is not None:
             return self._of_routine(exchange.action, data if response.positive else None, code)
@@ -290,9 +290,9 @@ class UdsClient:
         return []
 
     def _count_unsolicited(self) -> None:
-        """Count an answer to nothing; what was given up may still come."""
-        if self._late:
-            self._late -= 1
+        """Count an answer without a request, unless it may be a late one that was given up."""
+        if self._given_up:
+            self._given_up -= 1
             return
         self._unsolicited += 1
         if self._unsolicited >= MIN_CONTRADICTIONS:
@@ -307,7 +307,7 @@ class UdsClient:
         status = None if data is None else _status(data)
         nothing_runs = data is None and code == ResponseCode.REQUEST_SEQUENCE_ERROR
         of_start = action is RoutineAction.START
-        # A negative response does not say to what: to the results there is but one of ours.
+        # A negative response names no action; results are refused by REQUEST_SEQUENCE_ERROR alone.
         if data is None and (of_start or (self._start_unanswered and not nothing_runs)):
             return self._refusal(code or 0)
         self._start_unanswered = self._start_unanswered and not of_start
@@ -319,7 +319,7 @@ class UdsClient:
         if status is None:
             return []
         if status.state is BitState.REFUSED and not self._started:
-            status = replace(status, state=BitState.IDLE)  # of an earlier request
+            status = replace(status, state=BitState.IDLE)  # it refused an earlier request
         return [status]
 
     def _refusal(self, code: int) -> list[BitStatus | BitRequest]:
@@ -333,7 +333,7 @@ class UdsClient:
         return [_refused(self._test_id, code)]
 
     def _keep(self, exchange: _Exchange, data: bytes, now: int) -> None:
-        """Keep identification data of the computer; what is damaged is left out."""
+        """Keep a record of the computer's result or identity; a damaged one is left out."""
         try:
             if exchange.record is None:
                 self._facts["trouble codes"] = _trouble_codes(data[1:])
@@ -381,7 +381,7 @@ def _answers(exchange: _Exchange, response: Response) -> bool:
 
 
 def _status(data: bytes) -> BitStatus | None:
-    """Return the status in a routine's answer; None where it has none."""
+    """Return the status in a routine's answer; None: it is damaged."""
     try:
         values = TEST_STATUS.numbers(data)
         return BitStatus(
@@ -396,7 +396,7 @@ def _status(data: bytes) -> BitStatus | None:
 
 
 def _refused(test_id: int, code: int) -> BitStatus:
-    """Return a refusal for which there is no reason but a negative response."""
+    """Return a refusal whose only reason is the code of a negative response."""
     known = code in set(ResponseCode)
     name = ResponseCode(code).name.lower().replace("_", " ") if known else "negative response"
     return BitStatus(BitState.REFUSED, test_id=test_id, refusal=f"{name} ({code:#04x})")

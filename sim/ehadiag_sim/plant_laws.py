@@ -303,7 +303,7 @@ def relative_viscosity(temperature: float) -> float:
     """
     slope = (WALTHER_W1 - WALTHER_W0) / (WALTHER_X1 - WALTHER_X0)
     exponent = WALTHER_W0 + slope * (math.log10(temperature + CELSIUS_OFFSET_K) - WALTHER_X0)
-    at, reference = (10.0 ** (10.0**w) for w in (exponent, WALTHER_W0))
+    at, reference = 10.0 ** (10.0**exponent), 10.0 ** (10.0**WALTHER_W0)
     return float((at - WALTHER_SHIFT) / (reference - WALTHER_SHIFT))
 
 

@@ -153,7 +153,7 @@ class UdsServer:
         return self._onboard()
 
     def _onboard(self) -> dict[str, float | str]:
-        """Return what the computer has found itself in its last test."""
+        """Return the computer's own result of its last test."""
         last, truth = self._last, self._computer.faults
         done = last is not None and last.state is BitState.COMPLETE and truth is not None
         state = OnboardState.DONE if done else OnboardState.GIVEN_UP

@@ -309,7 +309,10 @@ def test_the_columns_of_former_tables_are_still_there(result: Result) -> None:
         "FDJ_std", "FDJ_low95", "FDJ_high95", "spool_rms", "pressure_rms", "oil_temperature_degC",
         "supply_pressure_MPa", "frames", "lost", "total_s", "reasons", "notes", "error",
     ]  # fmt: skip
-    assert [name for name in result_columns() if name in former] == former
+    columns = list(result_columns())
+    assert [name for name in columns if name in former] == former
+    if [item.name for item in FAULTS] == ["Kintas", "FSS", "FDJ"]:  # a further one stands within
+        assert columns[: len(former)] == former
     row = result_row(result)
     assert row["oil_temperature_degC"] == 40.0
     assert row["frames"] == 11331

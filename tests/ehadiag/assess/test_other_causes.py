@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace
 from places import LOGS
 
+import ehadiag
 from ehadiag import Actuator, ConfigurationError, Verdict, bundled_tests, default_actuator
 from ehadiag.assess import diagnosis
 from ehadiag.assess.acceptance import objections_to_estimate
@@ -104,6 +105,8 @@ def test_a_play_beyond_its_limit_stands_for_friction_where_more_than_noise_is_le
     note = note_on_stand_ins(found(doubtful, **{name: (size, 1e-9)}), doubtful)
     assert bool(note) is stands_in
     assert note_on_stand_ins(found(**{name: (size, 1e-9)}), NOISE) == ""
+    without_limit = [replace(item, limit=None) for item in found(doubtful, **{name: (size, 1e-9)})]
+    assert note_on_stand_ins(without_limit, doubtful) == ""
 
 
 def test_searches_that_leave_more_than_noise_in_closed_loop_are_an_objection():
@@ -237,6 +240,33 @@ def test_a_modelled_peak_where_the_pressure_is_lower_than_its_top_is_none_of_it(
     pressure = response.pressure.copy()
     pressure[lower] = 1.5 * np.nanmax(np.abs(experiment.pressure))
     assert objections_to_supply(experiment, replace(response, pressure=pressure), offset) == []
+
+
+@pytest.mark.parametrize(("beside", "named"), [(0.96, True), (0.82, False)])
+def test_a_pressure_is_cut_off_only_near_its_top(sound, beside, named):
+    """The tick beside a peak that the supply cut off was 2 to 4 % lower, a sound swing 18 %."""
+    experiment, response, offset = sound
+    top = int(np.nanargmax(experiment.pressure - offset))
+    modelled, measured = response.pressure.copy(), experiment.pressure.copy()
+    measured[[top, top + 1]] = offset + 4e6 * np.array([1.0, beside])
+    modelled[[top, top + 1]] = 6e6
+    changed = replace(response, pressure=modelled)
+    objections = objections_to_supply(replace(experiment, pressure=measured), changed, offset)
+    assert bool(objections) == named
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("faults", "share"), [((0.3, 0.2, 0.6), 0.6), ((0.2, 0.2, 0.2), 0.5)])
+def test_a_supply_at_half_of_its_probe_has_no_verdict(faults, share):
+    """Two ticks show it; `FDJ` was 13 deviations off."""
+    supply = ACTUATOR.servovalve.PSR
+    names = dict(zip(("Kintas", "FSS", "FDJ"), faults, strict=True))
+    recording = ehadiag.simulate("closed", supply_pressure=share * supply, **names)
+    at_return = recording.environment.return_pressure or 0.0
+    told = replace(recording.environment, supply_pressure=at_return + supply)
+    result = ehadiag.diagnose(replace(recording, environment=told))
+    assert result.verdict is Verdict.NOT_TESTED
+    assert result.reasons[0].startswith("the pressure stops at -")
 
 
 def test_nothing_is_said_without_samples(sound):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from ehadiag.compile.elementary import exponential, logarithm
 from ehadiag.model.laws import (
     SPOOL_DYNAMIC_FRICTION_SHARE,
     bridge_bend,
+    bridge_load,
     bridge_speed,
     bridge_stall,
     jack_law,
@@ -126,9 +129,31 @@ def bridge_of(k, x, load):
 @pytest.mark.parametrize("k", [1.0, 0.6, 0.3])
 @pytest.mark.parametrize("load", [0.02, 0.1, 0.3])
 def test_the_bridge_is_that_of_its_orifices(k, load):
-    assert bridge_speed(k * k, load, 1.0) == pytest.approx(bridge_of(k, 1.0, load), abs=2e-4)
-    assert bridge_speed(k * k, load, 0.8) == pytest.approx(bridge_of(k, 0.8, load), abs=2e-4)
-    assert bridge_of(k, bridge_stall(k * k, load), load) == pytest.approx(0.0, abs=2e-4)
+    for x in (0.8, 1.0):
+        assert bridge_speed(k * k, load, 0.0, x) == pytest.approx(bridge_of(k, x, load), abs=1e-8)
+    assert bridge_of(k, bridge_stall(k * k, load), load) == pytest.approx(0.0, abs=1e-8)
+
+
+@given(
+    k=st.floats(0.2, 1.0),
+    share=st.floats(0.0, 1.0),
+    viscous=st.floats(0.0, 2.0),
+    x=st.floats(0.05, 1.1),
+)
+def test_a_bridge_balances_up_to_its_stall(k, share, viscous, x):
+    """Friction of any size and cold oil; Newton's method had speeds of -12 and +900."""
+    part, near, far = k * k, max(1.0 - x, 0.0), 1.0 + x
+    load = share * bridge_load(part, near, far, 0.0)[0]
+    assert bridge_stall(part, load) <= x + 1e-7
+    speed = bridge_speed(part, load, viscous, x)
+    assert 0.0 <= speed <= math.sqrt(2.0) / k
+    found = optimize.brentq(
+        lambda flow: bridge_load(part, near, far, flow)[0]
+        - load
+        - viscous * bridge_load(part, near, far, flow)[1],
+        0.0, 1.0, xtol=1e-14,
+    )  # fmt: skip
+    assert speed == pytest.approx(bridge_load(part, near, far, found)[1], abs=1e-8)
 
 
 def test_the_kernels_agree_on_a_bridge_whose_null_is_off():

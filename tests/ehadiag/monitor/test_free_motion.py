@@ -6,10 +6,12 @@ tables and against white noise.
 
 from __future__ import annotations
 
+import math
 import re
 import subprocess
 import sys
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,8 +20,14 @@ from places import ROOT
 
 from ehadiag import CommandMode, ConfigurationError, Monitor, Tick, default_actuator
 from ehadiag.model.batch import NO_ANCHOR
+from ehadiag.model.plant import SLIP_TICKS
 from ehadiag.monitor.plan import CUSUM_COUNT, CusumDesign, design_cusum, mean_run_length
-from ehadiag.monitor.streaming import SETTLING_TICKS, FreeMotionMonitor, undecided_spool
+from ehadiag.monitor.streaming import (
+    SETTLING_TICKS,
+    FreeMotionMonitor,
+    undecided_spool,
+    undecided_travel,
+)
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.simulation import Plant
 from ehadiag_tools.free_motion.motion import Motion, free_motion
@@ -68,6 +76,24 @@ def held(seconds, seed=0):
         codes = plant.tick(command, CommandMode.POSITION)
         rows.append([command, *((codes - 2048) * lsb)])
     return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("share", "lost", "counts"), [(0.5, False, False), (2.0, False, True), (2.0, True, False)]
+)
+def test_the_pressure_of_a_jack_that_slips_on_oil_does_not_count(share, lost, counts):
+    stage = msgspec.structs.replace(ACTUATOR.second_stage, kind="orifice")
+    actuator = msgspec.structs.replace(ACTUATOR, second_stage=stage)
+    travel = undecided_travel(actuator, WORN[2])
+    monitor = FreeMotionMonitor(Monitor(actuator, WORN), 0.0, travel=travel)
+    step = share * travel / SLIP_TICKS
+    places = [step * k for k in range(2 * SLIP_TICKS)]
+    if lost:
+        places[-1] = math.nan
+    seen = [monitor.push((0.0, 0.0, 1e-4, 1e6, place)).residual[1] for place in places]
+    assert np.isfinite(seen[-1]) == counts
+    assert not np.isfinite(seen[:SLIP_TICKS]).any()
+    assert undecided_travel(ACTUATOR, WORN[2]) == 0.0, "without oil nothing rings"
 
 
 def test_the_pressure_says_nothing_while_the_surface_is_held():

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import can
+import msgspec
 import pytest
 from places import LOGS
 
 import ehadiag
-from ehadiag.core.actuator import default_actuator
+from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality, default_actuator
 from ehadiag.live import Snapshot
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.emulator import EmulatorTransport, emulated_computer
@@ -277,6 +278,22 @@ def test_decoded_signals_are_watched_live_as_the_frames_are(tmp_path: Path) -> N
         assert (found.ticks, found.alarm_count) == (recording.samples.ticks, 0)
         assert found.monitored > 0.9 * found.ticks
         assert found.enough
+
+
+def test_what_the_calibration_left_is_no_change_of_the_unit() -> None:
+    """A worn unit is no alarm to a model that errs by as much of the unit as new."""
+    alarms = []
+    for excess in (1.16, 1e6):
+        fit = FitQuality(excess=excess, outliers=0.0, spool_rms=1.0, pressure_rms=1.0)
+        calibration = Calibration(
+            date="2026-01-02T03:04:05Z", start="reference-31", effects={"hysteresis": 0.0},
+            parameters=("hysteresis",), std=(1e-5,), root=((1.0,),), fit=fit,
+            recordings=(CalibrationSource(name="a.blf", test="open"),),
+        )  # fmt: skip
+        unit = msgspec.structs.replace(default_actuator(), calibration=calibration)
+        found = ehadiag.watch(LOGS / "paper-closed-4.blf", actuator=unit)
+        alarms.append(found.alarm_count)
+    assert alarms[0] > 0 == alarms[1]
 
 
 def test_a_list_of_decoded_signals_is_watched() -> None:
