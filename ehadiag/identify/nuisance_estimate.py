@@ -242,12 +242,15 @@ def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
     # At a bound of the friction the points go no farther.
     reached = (points[:, place] - refined.x[place]) / along[place]
     shifts, kept = np.unique(reached, return_index=True)
-    costs = cauchy_cost(model.many(points[kept]))
     unit = max(excess_cost(refined.residuals), 1.0)
-    weights = np.exp(-0.5 * (costs - costs.min()) / unit)
-    moment = float(weights @ shifts**2 / weights.sum())
-    extra = max(moment - 1.0, 0.0) * np.outer(along, along)
-    return np.asarray(extra * np.outer(refined.scale, refined.scale))
+    costs = cauchy_cost(model.many(points[kept])) / unit
+    weights = np.exp(-0.5 * (costs - costs.min()))
+    extra = max(float(weights @ shifts**2 / weights.sum()) - 1.0, 0.0)
+    beside = np.abs(np.diff(costs))[np.abs(shifts[1:] - 0.5) <= 1.0]
+    if beside.max(initial=0.0) > BREAK_AWAYS.event_cost:
+        # Where the floor ends a break-away comes at another tick: what the model errs decides that.
+        extra += (AMBIGUOUS_STDS[FRICTION_NAME] / (along[place] * refined.scale[place])) ** 2
+    return np.asarray(extra * np.outer(along, along) * np.outer(refined.scale, refined.scale))
 
 
 def _is_hysteresis_small(refined: Refinement, experiments: Sequence[Experiment]) -> bool:
@@ -344,6 +347,11 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
+MAX_ORIGINS = 3
+"""Largest number of origins of the spool, 1, each less the offset that was found with the one
+before."""
+
+
 class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
@@ -391,10 +399,15 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         Where friction holds the spool the first break-away comes at another tick otherwise, and
         hysteresis stands in for friction.
         """
-        offset = found.refined.values["spool_offset"]
-        moved = [item.with_origin(offset) for item in experiments]
-        other = self._with(moved, self.prior, hint, before)
-        return _better_of(found, other)
+        for _ in range(MAX_ORIGINS):
+            offset = found.refined.values["spool_offset"]
+            moved = [item.with_origin(offset) for item in experiments]
+            further = self._with(moved, self.prior, hint, before)
+            found = _better_of(found, further)
+            shift = further.refined.values["spool_offset"] - offset
+            if found.refined is not further.refined or abs(shift) < experiments[0].spool_noise:
+                break
+        return found
 
     def _loosened(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,
