@@ -213,11 +213,16 @@ def estimate_about(
         ambiguous = (ambiguous and found.starts > 1) or _has_event(
             refined.residuals, refined.weighted
         )
+    if ambiguous:
+        covariance = (
+            covariance
+            + independent_covariance(refined.parameters, AMBIGUOUS_STDS)
+            + _ends_covariance(found, model.scale)
+        )
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
         covariance=covariance
-        + independent_covariance(refined.parameters, AMBIGUOUS_STDS if ambiguous else {})
         + profile,
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
@@ -312,6 +317,17 @@ def optima_covariance(found: MultistartResult, scale: Array) -> Array:
     weights = np.exp(-0.5 * (costs - found.cost) / unit)
     shifts = np.array([place.x - found.density.x for place in found.places]) * scale
     return np.asarray((shifts.T * (weights / weights.sum())) @ shifts)
+
+
+def _ends_covariance(found: MultistartResult, scale: Array) -> Array:
+    """Covariance of the ends that the best one does not explain far more than, SI, shape (k, k).
+
+    Where the noise breaks the spool away, costs of ends differ by break-aways at other ticks, which
+    is no likelihood of the severities: such ends have the same weight.
+    """
+    alike = [item for item in found.places if item.cost * GIVE_UP.max_changed_share <= found.cost]
+    shifts = np.array([item.x - found.density.x for item in alike]) * scale
+    return np.asarray(shifts.T @ shifts / len(alike))
 
 
 TRIAL_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
