@@ -151,6 +151,10 @@ def estimate_about(
 ) -> NuisanceEstimate:
     """Estimate parameters about the end of a search, see `estimate_nuisances`."""
     model, found = staged.model, staged.found
+    if found.explained:
+        names = [item.name for item in model.estimated]
+        values = dict(zip(names, (found.density.x * model.scale).tolist(), strict=True))
+        experiments = [item.with_origin(values["spool_offset"]) for item in experiments]
     judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
     held = [item.parameter for item in considered]
 
