@@ -226,8 +226,7 @@ def estimate_about(
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
-        covariance=covariance
-        + profile,
+        covariance=covariance + profile,
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
