@@ -46,8 +46,9 @@ def estimate_covariance(refinement: Refinement) -> Array:
     A severity that the test does not show has the variance of a uniform density, or of what was
     known beforehand. Oil and supply of the day are unknowns, too, with a density of unit width. On
     top comes what the considered parameters do: where one of them is off by a deviation the
-    estimate moves in proportion (Schmidt, Advances in Control Systems 3, 1966); and
-    `ESTIMATION.discrepancy_std`, for what either side's integration is off.
+    estimate moves in proportion (Schmidt, Advances in Control Systems 3, 1966);
+    `ESTIMATION.discrepancy_std`, for what either side's integration is off; and the last step of a
+    search that did not come to rest, as between break-aways it does not.
     """
     count, used = len(refinement.x), refinement.used
     information = refinement.information
@@ -77,6 +78,8 @@ def estimate_covariance(refinement: Refinement) -> Array:
         out += np.outer(shift, shift)
     out = out[:count, :count]
     out += ESTIMATION.discrepancy_std**2 * np.eye(count)
+    if not refinement.converged:
+        out += np.outer(refinement.step, refinement.step)
     return np.asarray(out * np.outer(refinement.scale, refinement.scale))
 
 

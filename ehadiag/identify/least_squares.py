@@ -66,6 +66,8 @@ class Refinement(msgspec.Struct, frozen=True, eq=False):
     """Whether the search came to rest."""
     anchored: int
     """How often the model was re-anchored at the optimum."""
+    step: Array
+    """The last one, in units of `scale`; shape (k,)."""
     information: Array | None = None
     """What was known beforehand: inverse covariance, in units of `scale`; shape (k, k)."""
     daily: Array = msgspec.field(default_factory=lambda: np.zeros((0, 0, 0)))
@@ -167,6 +169,7 @@ def _refinement(
         evaluations=model.evaluations,
         converged=settled,
         anchored=anchored,
+        step=x - linear.at,
     )
 
 

@@ -25,6 +25,7 @@ def refinement(jacobian, used, severities=(0.5, 0.4, 0.8)):
         evaluations=1,
         converged=True,
         anchored=0,
+        step=np.zeros(3),
     )
 
 

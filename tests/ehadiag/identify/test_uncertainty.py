@@ -42,6 +42,7 @@ def linear_problem(seed, noise):
         evaluations=0,
         converged=True,
         anchored=0,
+        step=np.full(K, 0.01),
     )
 
 
@@ -103,6 +104,13 @@ def test_deviations_are_those_of_the_curvature_when_all_is_well():
     stated = np.sqrt(np.diag(estimate_covariance(fit)))
     assert (stated >= 0.999 * curved).all()
     assert (stated < 1.5 * curved).all()
+
+
+def test_the_last_step_of_a_search_that_did_not_settle_is_in_the_deviation():
+    fit = linear_problem(0, white(np.random.default_rng(5)))
+    unsettled = np.diag(estimate_covariance(replace(fit, converged=False)))
+    step = (fit.step * fit.scale) ** 2
+    assert np.allclose(unsettled - np.diag(estimate_covariance(fit)), step)
 
 
 def test_rows_left_out_carry_nothing():
