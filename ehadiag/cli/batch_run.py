@@ -19,14 +19,12 @@ from ehadiag.batch.result_files import (
     JUNIT_NOT_TESTED,
     RESULT_SUFFIXES,
     TABLE_FORMATS,
-    BatchSummary,
     ResultSink,
     junit_report,
     result_file_suffix,
-    summary_lines,
     write_summary,
 )
-from ehadiag.batch.workers import LogInput, Workers, worker_count
+from ehadiag.batch.workers import Workers, worker_count
 from ehadiag.cli.options import positive_count
 from ehadiag.cli.result_output import ResultWriter
 from ehadiag.core.interruption import (
@@ -39,13 +37,18 @@ from ehadiag.result import Log, Result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     INPUT_OUTPUT_EXIT_CODE,
+    BatchSummary,
     counting_bar,
     print_compiling_notice,
     print_status,
     progress_bar,
+    summary_lines,
     worst_exit_code,
 )
-from firmware_iface.errors import EhadiagError, InputOutputError
+from firmware_iface.errors import (
+    EhadiagError,
+    InputOutputError,
+)
 from firmware_iface.recording import Recording
 
 MIN_RECORDINGS_FOR_SUMMARY = 5
@@ -409,3 +412,12 @@ def _abandoned_task(setups: Sequence[Setup], task: _BatchTask) -> tuple[Finding,
     name = task.item.name
     text = f"log {name}: the process that diagnosed it ended, twice; not enough memory?"
     return (Finding(setups[task.unit].failure(name, text, INPUT_OUTPUT_EXIT_CODE)),)
+
+
+class LogInput(msgspec.Struct, frozen=True):
+    """One recording to diagnose."""
+
+    name: str
+    """As it was named, or as it was found."""
+    why: str = ""
+    """Why there is none; empty for a recording."""

@@ -11,16 +11,17 @@ from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import (
+from ehadiag.cli.options import (
     HISTORY_VARIABLE,
     add_history_option,
     add_usage_options,
     history_path,
     open_named_history,
+    unit_number,
     units_of,
     usage_from_options,
+    user_history_path,
 )
-from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.core.conventions import utc_time_text
 from ehadiag.estimate import INTERVAL_STDS
@@ -34,7 +35,6 @@ from ehadiag.history.records import (
     entry_object,
     event_object,
     of_unit,
-    user_history_path,
 )
 from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.report.head import shown_date

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import hashlib
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -18,8 +19,8 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.assess.verdict import Levels, Verdict
-from ehadiag.cli.defaults import DEFAULTS_FILE_NAME, user_defaults_file
-from ehadiag.cli.history_options import HistoryWriter, history_path
+from ehadiag.cli.command_parser import DEFAULTS_FILE_NAME, user_defaults_file
+from ehadiag.cli.options import history_path, usage_from_options
 from ehadiag.core.conventions import MAX_RESULT_BYTES, SIGNAL_FILE_SUFFIXES
 from ehadiag.core.interruption import defer_signals
 from ehadiag.report.rendering import diagnosis_html_page
@@ -42,7 +43,8 @@ from firmware_iface.errors import (
 from firmware_iface.files import RESULT_MODE, Folder, write_errors
 
 if TYPE_CHECKING:
-    from ehadiag.history.store import HistorySnapshot
+    from ehadiag.history.records import Usage
+    from ehadiag.history.store import History, HistorySnapshot
     from ehadiag.prognosis.units import Prognosis
 
 INPUT_FILE_OPTIONS = ("actuator", "mapping", "dbc", "test", "prior")
@@ -402,3 +404,101 @@ def _is_same_recording(folder: Folder, name: str, result: Result) -> bool:
 def _recording_identity(origin: Origin) -> tuple[object, ...]:
     """What tells one recording from others."""
     return origin.source, origin.date, origin.serial, origin.log
+
+
+def append_result(
+    place: Path, result: Result, usage: Usage, *, simulated: bool = False, create: bool = True
+) -> None:
+    """Append a result to a history; InputOutputError where it cannot be, and nothing of it is."""
+    from ehadiag.history.records import history_entry  # noqa: PLC0415
+    from ehadiag.history.store import History  # noqa: PLC0415
+
+    entry = history_entry(result, usage, simulated=simulated)
+    try:
+        with History(place, create=create) as history:
+            history.append(entry)
+    except ConfigurationError as error:  # exchanged since the call began
+        raise InputOutputError(str(error)) from None
+
+
+class HistoryWriter:
+    """Appends the diagnoses of one call to the history, where there is one.
+
+    arguments: the parsed command line. ConfigurationError: hours or cycles without a history; the
+    file is none; InputOutputError: the history cannot be opened.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._kept: set[bytes] | None = None
+        """Digests of what was in it when that was asked first."""
+        self.place = self._place()
+        """Of the history; None: nothing is kept."""
+        if self.place is not None:
+            self._try()
+        elif arguments.hours is not None or arguments.cycles is not None:
+            raise ConfigurationError(
+                "--hours, --cycles: no health history to keep them in: name one by --history, or"
+                " begin one by ehadiag history init"
+            )
+
+    def keep(self, result: Result) -> None:
+        """Append a result; InputOutputError where it cannot be, and then nothing of it is."""
+        if self.place is None:
+            return
+        append_result(
+            self.place, result, usage_from_options(self._arguments), simulated=self._simulated
+        )
+
+    def snapshot(self) -> HistorySnapshot | None:
+        """Return the history as it is now; None where there is none."""
+        if self.place is None or not self.place.exists():
+            return None
+        from ehadiag.history.store import HistorySnapshot  # noqa: PLC0415
+
+        with self._open() as history:
+            return HistorySnapshot(self.place, history.last_number)
+
+    def has(self, result: Result) -> bool:
+        """Whether a result need not be appended: it was, or there is no history."""
+        if self.place is None:
+            return True
+        if not self.place.exists():
+            return False
+        if self._kept is None:
+            with self._open() as history:
+                self._kept = {_line_digest(kept) for kept in history.results()}
+        return _line_digest(result.to_json()) in self._kept
+
+    @property
+    def _simulated(self) -> bool:
+        return bool(getattr(self._arguments, "simulate", False))
+
+    def _place(self) -> Path | None:
+        if self._arguments.no_history:
+            if self._arguments.history:
+                raise ConfigurationError("--history and --no-history exclude each other")
+            return None
+        if self._simulated and not self._arguments.history:
+            return None  # a simulated unit is none of the fleet's unless somebody wants it there
+        return history_path(self._arguments)
+
+    def _try(self) -> None:
+        """Say before a test begins or a log is read what is wrong; make no file yet."""
+        assert self.place is not None
+        if os.path.lexists(self.place):
+            self._open().close()
+        elif not os.access(self.place.parent, os.W_OK | os.X_OK):
+            raise InputOutputError(
+                f"history {self.place}: cannot be opened: no such folder, or no right to it"
+            )
+
+    def _open(self) -> History:
+        from ehadiag.history.store import History  # noqa: PLC0415
+
+        assert self.place is not None
+        return History(self.place, create=True)
+
+
+def _line_digest(line: str) -> bytes:
+    return hashlib.sha256(line.encode()).digest()

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import (
+from ehadiag.cli.options import (
     add_history_option,
     add_usage_options,
     open_named_history,

@@ -13,7 +13,6 @@ import os
 import stat
 from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -29,23 +28,6 @@ if TYPE_CHECKING:
 
 DIAGNOSIS_TABLE, EVENT_TABLE = "diagnosis", "event"
 """Kinds of what can be withdrawn, and their tables."""
-
-
-HISTORY_FILE_NAME = "history.sqlite"
-
-
-def user_history_path() -> Path | None:
-    """File of the user's own history, whether or not it exists; None where no home is known.
-
-    In `$XDG_DATA_HOME/ehadiag`, else `~/.local/share/ehadiag`; on Windows in `%LOCALAPPDATA%`.
-    """
-    if (xdg := os.environ.get("XDG_DATA_HOME")) and os.path.isabs(xdg):
-        return Path(xdg, "ehadiag", HISTORY_FILE_NAME)
-    if home := os.environ.get("HOME"):
-        return Path(os.path.abspath(home), ".local", "share", "ehadiag", HISTORY_FILE_NAME)
-    if local := os.environ.get("LOCALAPPDATA"):  # Windows
-        return Path(local, "ehadiag", HISTORY_FILE_NAME)
-    return None
 
 
 class Usage(msgspec.Struct, frozen=True):

@@ -20,8 +20,8 @@ from rich.console import Console
 import ehadiag
 from ehadiag import Levels
 from ehadiag.batch.result_files import csv_table
-from ehadiag.cli.history_options import append_result
 from ehadiag.cli.main import main
+from ehadiag.cli.result_output import append_result
 from ehadiag.estimate import Culprit, Effect
 from ehadiag.history.records import Usage
 from ehadiag.prognosis.forecast import RemainingLife
