@@ -16,8 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.acceptance import residual_limits
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, residual_limits
 from ehadiag.compile.elementary import (
     C_FUNCTIONS,
     ROUNDING_FUNCTIONS,

@@ -35,6 +35,7 @@ from ehadiag.export.fmu import FMU_UNITS, actuator_variables, monitor_variables
 from ehadiag.history.records import Usage, history_entry
 from ehadiag.history.store import History
 from ehadiag.identify.identification_result import Nuisance
+from ehadiag.identify.prior import unit_prior
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, REGISTRY, SENSOR_OFFSETS, Unknowns, parameter
@@ -71,7 +72,7 @@ def everything(result: Result) -> Result:
         item.name: Nuisance(0.3 * item.scale, 0.01 * item.scale, at_bound=False) for item in EFFECTS
     }
     found = replace(found, nuisances=nuisances)
-    effects = effects_of(found, result.diagnosis.actuator)
+    effects = effects_of(found, unit_prior(result.diagnosis.actuator), result.diagnosis.actuator)
     return result_of(replace(result.diagnosis, identification=found, effects=effects))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ehadiag.assess.acceptance import objections_to_estimate
+from ehadiag.assess.verdict import objections_to_estimate
 from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag.core.actuator import Actuator, default_actuator, with_tolerance
 from ehadiag.identify.experiment import (
