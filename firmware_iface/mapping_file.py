@@ -114,6 +114,11 @@ class ChannelSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position: ChannelRef
 
 
+COMMAND_MODES: dict[Literal["current", "position"], CodeNumber] = {"current": 1, "position": 2}
+REQUEST_CODES: dict[Literal["start", "abort"], CodeNumber] = {"start": 1, "abort": 2}
+"""Numbers on the bus, unless a mapping says others."""
+
+
 class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the computer commands; at least one of current and position."""
 
@@ -122,7 +127,7 @@ class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mode: SignalRef | None = None
     test_id: SignalRef | None = None
     modes: dict[Literal["current", "position"], CodeNumber] = msgspec.field(
-        default_factory=lambda: {"current": 1, "position": 2}
+        default_factory=COMMAND_MODES.copy
     )
 
 
@@ -143,7 +148,7 @@ class StatusSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     elapsed: SignalRef | None = None
     serial: SignalRef | None = None
     states: dict[BitStateName, CodeNumber] = msgspec.field(
-        default_factory=lambda: {name: number for number, name in enumerate(get_args(BitStateName))}
+        default_factory={name: number for number, name in enumerate(get_args(BitStateName))}.copy
     )
 
 
@@ -153,7 +158,7 @@ class RequestSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: SignalRef | None = None
     test_id: SignalRef | None = None
     codes: dict[Literal["start", "abort"], CodeNumber] = msgspec.field(
-        default_factory=lambda: {"start": 1, "abort": 2}
+        default_factory=REQUEST_CODES.copy
     )
 
 

@@ -269,13 +269,12 @@ def run_warmup(_arguments: argparse.Namespace) -> int:
     """Compile."""
     begin = time.perf_counter()
     from ehadiag.compile import libraries  # noqa: PLC0415 - not for help texts
-    from ehadiag.compile.sources import cache_folder  # noqa: PLC0415
     from firmware_iface.bus_map import default_map  # noqa: PLC0415
 
     absent = libraries.missing(libraries.SHIPPED)
     libraries.prepare(absent, print_status)
     default_map()  # keeps what it finds in the DBC
-    folder = cache_folder()
+    folder = libraries.cache_folder()
     took = f"{time.perf_counter() - begin:.1f} s"
     if not absent:
         print_status("all kernels are there")

@@ -23,8 +23,7 @@ from ehadiag.compile.elementary import (
     square_root,
 )
 from ehadiag.compile.jit import Array
-from ehadiag.compile.libraries import object_files
-from ehadiag.compile.sources import source_hash
+from ehadiag.compile.libraries import object_files, source_hash, tool_versions
 from ehadiag.compile.vector import BYTES_PER_NUMBER
 from ehadiag.compile.worker import (
     CFunction,
@@ -32,7 +31,6 @@ from ehadiag.compile.worker import (
     PointerArgument,
     Processor,
     TableArgument,
-    tool_versions,
 )
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, __version__

@@ -64,7 +64,7 @@ def everything(result: Result) -> Result:
     """The same as if every parameter of the registry had been estimated."""
     from msgspec.structs import replace
 
-    from ehadiag.assess.other_causes import effects_of
+    from ehadiag.assess.other_causes import effects_of, with_limits
 
     found = result.diagnosis.identification
     assert found is not None
@@ -72,8 +72,16 @@ def everything(result: Result) -> Result:
         item.name: Nuisance(0.3 * item.scale, 0.01 * item.scale, at_bound=False) for item in EFFECTS
     }
     found = replace(found, nuisances=nuisances)
-    effects = effects_of(found, unit_prior(result.diagnosis.actuator), result.diagnosis.actuator)
-    return result_of(replace(result.diagnosis, identification=found, effects=effects))
+    actuator = result.diagnosis.actuator
+    effects = effects_of(found, unit_prior(actuator), actuator)
+    return result_of(
+        replace(
+            result.diagnosis,
+            identification=found,
+            effects=effects,
+            other=with_limits(effects, actuator),
+        )
+    )
 
 
 def keys_of(tree: Any, at: str = "") -> set[str]:
