@@ -152,7 +152,7 @@ def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
             bus_map.policy.crc == "flag",
             bus_map.policy.range == "flag",
         )
-    onboard = np.zeros(len(table), dtype=np.bool_)
+    onboard = np.zeros_like(foreign)
     for message in bus_map.onboard:
         onboard[rows_of(table, message)] = True
     foreign &= ~onboard

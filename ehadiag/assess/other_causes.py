@@ -20,9 +20,10 @@ import numpy as np
 from ehadiag.assess.verdict import Verdict, is_explained_by_discrepancy_alone
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import finite
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95, VERDICT
-from ehadiag.estimate import Culprit, Effect, Suspect, finite
+from ehadiag.estimate import Culprit, Effect, Suspect
 from ehadiag.identify.experiment import (
     Experiment,
     lay_out_spans,

@@ -29,6 +29,7 @@ from ehadiag.cli.options import positive_count
 from ehadiag.cli.result_output import ResultWriter
 from ehadiag.core.interruption import (
     INTERRUPTED_EXIT_CODE,
+    defer_signals,
     ignore_interrupt_in_worker,
     interrupt_on_signals,
 )
@@ -121,8 +122,7 @@ def diagnose_and_deliver(
         found = setup.not_tested(
             recordings, "stopped by the user", files=files, logs=logs, read_s=read_s
         )
-    draw = partial(diagnosis_png, found) if found.can_be_drawn else None
-    return found, results.deliver(found, name or setup.name(files[0], found), draw)
+    return found, results.deliver(found, name or setup.name(files[0], found))
 
 
 class Finding(NamedTuple):
@@ -322,9 +322,8 @@ class BatchRun:
             if result.error is not None:
                 self._fail(result)
                 return
-            draw = None if picture is None else lambda content=picture: content
             name = setup.name(task.item.name, result)
-            code = self._results.deliver(result, name, draw, alone=False)
+            code = self._results.deliver(result, name, picture, alone=False)
             self._take(result, unit=task.unit)
             self._summary.codes.add(code)
         self._came += 1
@@ -385,7 +384,8 @@ class BatchRun:
         self._interrupted = True
 
     def _conclude(self, workers: int) -> int:
-        """Tell of all; return the exit code."""
+        """Tell of all; return the exit code, which no signal changes any more."""
+        defer_signals()
         codes = self._summary.codes
         code = (
             next(iter(codes), 0)

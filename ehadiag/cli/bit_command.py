@@ -21,7 +21,6 @@ from ehadiag.cli.result_output import (
 )
 from ehadiag.cli.simulator_options import add_simulator_options, simulator_settings
 from ehadiag.core.interruption import stop_on_signals
-from ehadiag.report.rendering import diagnosis_png
 from ehadiag.request import TEST
 from ehadiag.session.bit_run import (
     BitSettings,
@@ -171,9 +170,8 @@ def run_bit(
         found = [item.diagnose(stop) for item in runs]
     codes = set()
     for result, setup in zip(found, setups, strict=True):
-        draw = partial(diagnosis_png, result) if result.can_be_drawn else None
         name = f"{path.stem}-{setup.label}" if setup.label else path.stem
-        codes.add(results.deliver(result, name, draw))
+        codes.add(results.deliver(result, name))
     return worst_exit_code(codes) if len(codes) > 1 else codes.pop()
 
 

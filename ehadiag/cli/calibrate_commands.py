@@ -25,9 +25,10 @@ from ehadiag.terminal.output import (
     print_status,
     print_text,
     progress_bar,
-    render_for_terminal,
     report_failure,
+    terminal_console,
     worst_exit_code,
+    write_drawn,
     write_output,
 )
 from firmware_iface.errors import (
@@ -112,8 +113,9 @@ def _print_calibrated(found: Calibrated, *, as_json: bool) -> None:
     if as_json:
         write_output(calibration_json(found) + "\n")
     else:
-        draw = partial(print_calibration, found)
-        write_output(render_for_terminal(draw, least=TABLE_COLUMNS))
+        console = terminal_console(least=TABLE_COLUMNS)
+        print_calibration(found, console)
+        write_drawn(console)
 
 
 def _write_outputs(
@@ -391,8 +393,9 @@ def _print_scores(
 
     if not arguments.json:
         for test, scored in found:
-            draw = partial(print_score, test, scored)
-            write_output(render_for_terminal(draw, least=TABLE_COLUMNS))
+            console = terminal_console(least=TABLE_COLUMNS)
+            print_score(test, scored, console)
+            write_drawn(console)
         return
     out = {"schema": DESIGN_SCHEMA, "actuator": arguments.actuator, "scored": score_tree(*found[0])}
     if arguments.out:

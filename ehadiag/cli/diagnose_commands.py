@@ -36,7 +36,6 @@ from ehadiag.cli.result_output import (
     reserved_stems,
 )
 from ehadiag.core.conventions import SIGNAL_FILE_SUFFIXES, fingerprint
-from ehadiag.core.interruption import defer_signals
 from ehadiag.report.rendering import diagnosis_html_page, index_html_page
 from ehadiag.request import Request, request_options
 from ehadiag.result import Log, Result, load_result
@@ -112,7 +111,10 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
         )
     # What is wrong with the options is said before anything slow is loaded.
     _refuse_diagnose_contradictions(arguments)
-    setups = [_loaded(unit) for unit in arguments_of_actuators(arguments)]
+    units = arguments_of_actuators(arguments)
+    setups = [options.setup_of(unit.arguments, unit.label) for unit in units]
+    for setup in setups:  # errors of its files come before a log is read
+        _ = setup.sources, setup.actuator, setup.prior
     if arguments.joint and len(setups) > 1:
         raise ConfigurationError("--mapping: --joint is of one actuator, name one mapping")
     outputs = _output_files(arguments)
@@ -130,13 +132,10 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     print_compiling_notice()
     if arguments.merge:
         codes = {_diagnose_merged(setup, results, inputs) for setup in setups}
-        code = worst_exit_code(codes) if len(codes) > 1 else codes.pop()
-    elif arguments.joint:
-        code = _diagnose_joint(setups[0], results, inputs)
-    else:
-        code = BatchRun(arguments, setups, results, inputs).run()
-    defer_signals()
-    return code
+        return worst_exit_code(codes) if len(codes) > 1 else codes.pop()
+    if arguments.joint:
+        return _diagnose_joint(setups[0], results, inputs)
+    return BatchRun(arguments, setups, results, inputs).run()
 
 
 def _refuse_diagnose_contradictions(arguments: argparse.Namespace) -> None:
@@ -159,13 +158,6 @@ def _output_files(arguments: argparse.Namespace) -> list[OutputFile]:
     named = [("--results", name) for name in arguments.results]
     named += [(f"--{key}", getattr(arguments, key)) for key in ("resume", "junit", "summary")]
     return [OutputFile(option, name) for option, name in named if name]
-
-
-def _loaded(unit: ActuatorArguments) -> Setup:
-    """Load the setup of one actuator, to raise errors of its files before a log is read."""
-    setup = options.setup_of(unit.arguments, unit.label)
-    _ = setup.sources, setup.actuator, setup.prior
-    return setup
 
 
 def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:

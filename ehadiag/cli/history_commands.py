@@ -39,7 +39,13 @@ from ehadiag.history.records import (
 from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.report.head import shown_date
 from ehadiag.report.rendering import isolated_png
-from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
+from ehadiag.terminal.output import (
+    print_status,
+    print_text,
+    terminal_console,
+    write_drawn,
+    write_output,
+)
 from firmware_iface.errors import (
     ConfigurationError,
     InputOutputError,
@@ -205,7 +211,9 @@ def _list(arguments: argparse.Namespace) -> None:
     rows += [(item.when, _event_row(item)) for item in events]
     for _, row in sorted(rows):
         table.add_row(*(printable(row[at]) for at in shown))
-    write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
+    console = terminal_console()
+    console.print(table, crop=False)
+    write_drawn(console)
 
 
 def _show(arguments: argparse.Namespace) -> None:

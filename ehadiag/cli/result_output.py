@@ -23,14 +23,15 @@ from ehadiag.cli.command_parser import DEFAULTS_FILE_NAME, user_defaults_file
 from ehadiag.cli.options import history_path, usage_from_options
 from ehadiag.core.conventions import MAX_RESULT_BYTES, SIGNAL_FILE_SUFFIXES
 from ehadiag.core.interruption import defer_signals
-from ehadiag.report.rendering import diagnosis_html_page
+from ehadiag.report.rendering import diagnosis_html_page, diagnosis_png
 from ehadiag.result import Origin, Result
 from ehadiag.terminal.output import (
     print_status,
     print_text,
-    render_for_terminal,
     report_failure,
+    terminal_console,
     worst_exit_code,
+    write_drawn,
     write_output,
 )
 from firmware_iface.errors import (
@@ -217,12 +218,12 @@ class ResultWriter:
         if not self._arguments.json:
             import ehadiag.report.result_tables  # noqa: PLC0415
 
-            render_for_terminal(lambda _: None)
+            terminal_console()
         if self._arguments.report:
             import ehadiag.report.report_pages  # noqa: F401, PLC0415
 
     def deliver(
-        self, result: Result, name: str, draw: Callable[[], bytes] | None, *, alone: bool = True
+        self, result: Result, name: str, picture: bytes | None = None, *, alone: bool = True
     ) -> int:
         """Write and print one result; return its exit code.
 
@@ -230,8 +231,8 @@ class ResultWriter:
         `worst_exit_code`). From here on signals do not change it: the first leaves the picture out,
         the second what is not out yet.
 
-        name: of the files, without suffix; made safe, and numbered where it is taken. draw: makes
-        the picture; None: there is none. alone: whether the time of a forecast is worth it.
+        name: of the files, without suffix; made safe, and numbered where it is taken. picture: PNG;
+        None: drawn here, where there are samples. alone: whether a forecast is worth its time.
         """
         came = defer_signals()
         codes = [result.exit_code]
@@ -245,7 +246,7 @@ class ResultWriter:
             with report_failure(codes):
                 self._print(result, self._prognosis(result) if alone else None)
             if stem is not None and self._folder is not None:
-                for what, suffix, content in self._attachments(result, draw):
+                for what, suffix, content in self._attachments(result, picture):
                     if came.is_set():
                         break
                     name = f"{stem}{suffix}"
@@ -325,11 +326,9 @@ class ResultWriter:
         from ehadiag.report.result_tables import print_result  # noqa: PLC0415
 
         verbose = self._arguments.verbose
-        write_output(
-            render_for_terminal(
-                lambda console: print_result(result, console, prognosis, verbose=verbose)
-            )
-        )
+        console = terminal_console()
+        print_result(result, console, prognosis, verbose=verbose)
+        write_drawn(console)
 
     def _write_json(self, result: Result, wanted: str) -> str | None:
         """Write the object under the first name that no other recording's result has."""
@@ -360,11 +359,11 @@ class ResultWriter:
         raise AssertionError("numbers have no end")
 
     def _attachments(
-        self, result: Result, draw: Callable[[], bytes] | None
+        self, result: Result, picture: bytes | None
     ) -> Iterator[tuple[str, str, Callable[[], bytes]]]:
         """Kind, suffix and content of what stands beside a result."""
-        if draw is not None and self.pictures:
-            yield "picture", ".png", draw
+        if self.pictures and (picture is not None or result.can_be_drawn):
+            yield "picture", ".png", lambda: picture or diagnosis_png(result)
         if self._arguments.report:
             yield "report", ".html", partial(self._page, result)
         for kind in self._signals if result.can_be_drawn else ():

@@ -20,7 +20,7 @@ from ehadiag.assess.verdict import Levels, Verdict
 from ehadiag.core.conventions import PIPE_COLUMNS, display_unit, to_precision
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
-from ehadiag.report.head import CUT_NOTE, CUT_OFF, full_name, head_of, percent
+from ehadiag.report.head import CUT_NOTE, CUT_OFF, head_of, percent
 from firmware_iface.errors import printable, valid_text
 
 if TYPE_CHECKING:
@@ -186,10 +186,10 @@ def _severities(head: Head, result: Result, console: Console) -> Table:
     ]
     if any(remarks):
         table.add_column("", no_wrap=True)
-    for item, remark in zip(severities, remarks, strict=True):
+    for bar, item, remark in zip(head.bars, severities, remarks, strict=True):
         low, high = item.interval
         table.add_row(
-            full_name(item.name) if console.width >= NAMED_COLUMNS else item.name,
+            f"{bar.name} ({bar.symbol})" if console.width >= NAMED_COLUMNS else bar.symbol,
             _number(item.estimate, 5),
             _number(item.std, 5),
             f"{low:.5f} … {high:.5f}",

@@ -21,8 +21,8 @@ from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import utc_text
-from ehadiag.estimate import Severity, finite
+from ehadiag.core.conventions import finite, utc_text
+from ehadiag.estimate import Severity
 from ehadiag.live import (
     BusState,
     BusTraffic,
@@ -32,8 +32,9 @@ from ehadiag.live import (
     Snapshot,
     publish,
 )
+from ehadiag.records import log_of
 from ehadiag.report.head import head_of
-from ehadiag.setup import Deadline, Setup, log_of
+from ehadiag.setup import Deadline, Setup
 from firmware_iface.bus_map import BusMap
 from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name
 from firmware_iface.files import unused_path

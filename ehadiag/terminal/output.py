@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from firmware_iface.errors import (
@@ -129,13 +130,12 @@ class _EncodedText(io.StringIO):
     encoding = "utf-8"
 
 
-def render_for_terminal(draw: Callable[[Console], None], *, least: int = 0) -> str:
-    """Return what is drawn on a console like standard output's, for `write_output`.
+def terminal_console(*, least: int = 0) -> Console:
+    """Return a console like standard output's, of which `write_drawn` writes what is drawn on it.
 
-    Not written by the console itself, which ends the program where a pipe is closed.
+    It does not write by itself: that would end the program where a pipe is closed.
 
-    draw: prints to the console that it is given; least: columns also on a narrower terminal.
-    Returns the text, with its end of line.
+    least: columns also on a narrower terminal.
     """
     from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
 
@@ -146,17 +146,19 @@ def render_for_terminal(draw: Callable[[Console], None], *, least: int = 0) -> s
     out = _EncodedText()
     out.encoding = sys.stdout.encoding or "utf-8"
     # Names of others are no markup.
-    draw(
-        Console(
-            file=out,
-            force_terminal=there.is_terminal,
-            highlight=False,
-            markup=False,
-            emoji=False,
-            width=width,
-        )
+    return Console(
+        file=out,
+        force_terminal=there.is_terminal,
+        highlight=False,
+        markup=False,
+        emoji=False,
+        width=width,
     )
-    return out.getvalue()
+
+
+def write_drawn(console: Console) -> None:
+    """Write to standard output what was drawn on a `terminal_console`."""
+    write_output(cast("_EncodedText", console.file).getvalue())
 
 
 class _ProgressLines:
@@ -288,7 +290,9 @@ def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) 
         shown = (*astuple(test)[:-1], "; ".join(test.remarks))
         table.add_row(*("-" if cell in (None, "") else printable(str(cell)) for cell in shown))
     print_text(source)
-    write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
+    console = terminal_console()
+    console.print(table, crop=False)
+    write_drawn(console)
 
 
 SUMMARY_SCHEMA = "ehadiag.summary/1"
@@ -323,7 +327,7 @@ class BatchSummary:
                 error = {"source": result.source, "error": result.error.text}
                 self._failures.append(error)
             return
-        verdict = result.verdict.name
+        verdict = result.state or "NOT_TESTED"
         self._verdicts[verdict] += 1
         if verdict == "NOT_TESTED":
             if len(self._not_tested) < MAX_FAILURES_NAMED:
@@ -334,13 +338,17 @@ class BatchSummary:
 
     def _rank(self, result: Result, verdict: str) -> None:
         """Keep it if it is among the worst units; of one unit the worst result."""
-        found = [item for item in result.severities.values() if item.estimate is not None]
+        found = [
+            (item.estimate, item)
+            for item in result.severities.values()
+            if item.estimate is not None
+        ]
         if not found:
             return
-        worst = max(found, key=lambda item: item.value)
+        severity, worst = max(found, key=itemgetter(0))
         unit = result.source if result.serial is None else ("serial", result.serial)
         before = self._worst.get(unit)
-        if before is None or before["estimate"] < worst.value:
+        if before is None or before["estimate"] < severity:
             self._worst[unit] = {
                 "serial": result.serial,
                 "source": result.source,

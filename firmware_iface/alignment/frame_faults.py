@@ -197,6 +197,7 @@ def slow_values(
             message,
             stamps,
             None if counter is None else counter[keep],
+            item.modulus,
             values,
             max(span_ns, int(np.ptp(stamps))),
         )

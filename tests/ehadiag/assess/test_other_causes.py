@@ -35,7 +35,7 @@ from ehadiag_sim.broken_hardware import simulate_broken
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
 from firmware_iface.files import decode_toml
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 NOISE = Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0, 0.003, 1.0)

@@ -32,7 +32,7 @@ from ehadiag.identify.identification_session import identify
 from ehadiag_sim.broken_hardware import simulate_broken
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.simulation import simulate
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 NAMES = ("healthy-open.blf", "paper-open-4.blf", "lossy-open.blf", "hot-worn-closed.asc")

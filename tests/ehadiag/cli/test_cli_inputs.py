@@ -24,7 +24,7 @@ from ehadiag.cli.command_parser import CommandParser
 from ehadiag.cli.diagnose_commands import expand_logs
 from ehadiag.cli.main import parse_arguments, parser_and_commands
 from ehadiag.terminal import output
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 
 HEALTHY = LOGS / "healthy-open.blf"
 

@@ -129,7 +129,8 @@ def counted(row, counter=None, stream=None, **bad):
     """What counting reads of a decoded message of 256 counts."""
     empty = np.empty(0, dtype=np.int64)
     return SimpleNamespace(
-        message=SimpleNamespace(name="M", modulus=256),
+        message=SimpleNamespace(name="M"),
+        modulus=256,
         row=np.array(row),
         counter=None if counter is None else np.array(counter),
         stream=np.zeros(len(row), dtype=np.int64) if stream is None else np.array(stream),

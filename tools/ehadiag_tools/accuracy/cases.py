@@ -53,8 +53,8 @@ from ehadiag_tools.simulator.units import (
 )
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS, Environment, Recording, Samples
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
 Severities = tuple[float, float, float]
