@@ -141,7 +141,9 @@ def run_bit(
         single = len(setups) == 1  # no screen shows several
         show = (snapshots or screen.take) if single else None
         shown = bool(snapshots or arguments.snapshots or can_show_screen(plain=arguments.plain))
-        monitor = _bit_monitor(setups[0], test, results.history, shown=shown) if single else None
+        monitor = (
+            _bit_monitor(setups[0], test, results.history.place, shown=shown) if single else None
+        )
         simulation = _Simulation()
         runs = [
             stack.enter_context(

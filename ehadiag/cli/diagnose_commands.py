@@ -126,7 +126,7 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     results = ResultWriter(
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
-    history = results.snapshot()
+    history = results.history.snapshot()
     if history is not None:  # a changed setup loads its files again
         setups = [replace(setup, history=history) for setup in setups]
     print_compiling_notice()

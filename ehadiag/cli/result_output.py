@@ -190,7 +190,8 @@ class ResultWriter:
         self._arguments = arguments
         self._folder = folder
         self._names = set(taken)
-        self._keeper = HistoryWriter(arguments)
+        self.history = HistoryWriter(arguments)
+        """Health history that the results are kept in."""
         if arguments.report and folder is None:
             raise ConfigurationError("--report: name by --out the folder where the page goes")
         self._signals = tuple(dict.fromkeys(arguments.signals))
@@ -203,15 +204,6 @@ class ResultWriter:
                 signal_library(kind)
         self.stopped = False
         """Whether a signal came while a result was brought out."""
-
-    @property
-    def history(self) -> Path | None:
-        """Health history that the results are kept in; None: in none."""
-        return self._keeper.place
-
-    def snapshot(self) -> HistorySnapshot | None:
-        """Return the history as it is now; None where there is none."""
-        return self._keeper.snapshot()
 
     def load(self) -> None:
         """Load what printing needs: a verdict must not wait for it."""
@@ -241,7 +233,7 @@ class ResultWriter:
             with report_failure(codes):
                 stem = self._write_json(result, plain_name(name))
             with report_failure(codes):
-                self._keeper.keep(result)
+                self.history.keep(result)
             written = [f"{stem}.json"]
             with report_failure(codes):
                 self._print(result, self._prognosis(result) if alone else None)
@@ -283,7 +275,7 @@ class ResultWriter:
 
         name: of the files, without suffix, as for `deliver`.
         """
-        return self._keeper.has(result) and self._has_files(result, plain_name(name))
+        return self.history.has(result) and self._has_files(result, plain_name(name))
 
     def _has_files(self, result: Result, wanted: str) -> bool:
         folder = self._folder
@@ -309,7 +301,7 @@ class ResultWriter:
 
     def _prognosis(self, result: Result) -> Prognosis | None:
         """Forecast the unit of a result that asks by when, from the history; some 0.3 s."""
-        place = self.history
+        place = self.history.place
         if place is None or result.serial is None or result.verdict is not Verdict.DEGRADED:
             return None
         from ehadiag.prognosis.units import forecast  # noqa: PLC0415 - loads numpy
@@ -371,7 +363,7 @@ class ResultWriter:
 
     def _page(self, result: Result) -> bytes:
         levels = Levels(self._arguments.advisory, self._arguments.limit)
-        return diagnosis_html_page(result, levels, self._keeper.place)
+        return diagnosis_html_page(result, levels, self.history.place)
 
 
 def _signals(result: Result, kind: str) -> bytes:
