@@ -208,7 +208,7 @@ class ResultWriter:
     def load(self) -> None:
         """Load what printing needs: a verdict must not wait for it."""
         if not self._arguments.json:
-            import ehadiag.report.result_tables  # noqa: PLC0415
+            import ehadiag.report.head  # noqa: PLC0415
 
             terminal_console()
         if self._arguments.report:
@@ -315,7 +315,7 @@ class ResultWriter:
         if self._arguments.json:
             write_output(result.to_json() + "\n")
             return
-        from ehadiag.report.result_tables import print_result  # noqa: PLC0415
+        from ehadiag.report.head import print_result  # noqa: PLC0415
 
         verbose = self._arguments.verbose
         console = terminal_console()

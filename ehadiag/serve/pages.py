@@ -25,7 +25,6 @@ from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
 from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table, levels_text
 from ehadiag.report.head import (
     full_name,
-    kept_advice,
     percent,
     plain_name,
     shown_date,
@@ -33,7 +32,12 @@ from ehadiag.report.head import (
 )
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
-from ehadiag.report.trend_bus_pictures import first_to_the_limit, has_trend, trend_column
+from ehadiag.report.trend_bus_pictures import (
+    first_to_the_limit,
+    has_trend,
+    kept_advice,
+    trend_column,
+)
 from ehadiag.result import Result
 from ehadiag.serve.server import Page
 from firmware_iface import FREE_MOTION

@@ -42,7 +42,7 @@ from ehadiag.model.registry import FAULTS, REGISTRY, SENSOR_OFFSETS, Unknowns, p
 from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.monitor.monitor_memory import MONITOR_UNIT_FIELDS
 from ehadiag.records import result_of
-from ehadiag.report.result_tables import diagnosis_text
+from ehadiag.report.head import diagnosis_text
 from ehadiag.result import Result, result_schema
 from ehadiag.session.unit_state import unit_state_from_history, unit_state_of
 from ehadiag_sim.conditions import Effects, Faults, Sensors, condition_options
