@@ -17,7 +17,7 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.batch.journal import list_tests
 from ehadiag.batch.result_files import is_result_table
 from ehadiag.cli import options
-from ehadiag.cli.batch_run import BatchRun, LogInput, add_batch_options, diagnose_and_deliver
+from ehadiag.cli.batch_run import BatchRun, LogInput, add_batch_options, readable_name
 from ehadiag.cli.command_parser import show_help
 from ehadiag.cli.options import (
     ActuatorArguments,
@@ -38,7 +38,7 @@ from ehadiag.cli.result_output import (
 from ehadiag.core.conventions import SIGNAL_FILE_SUFFIXES, fingerprint
 from ehadiag.report.rendering import diagnosis_html_page, index_html_page
 from ehadiag.request import Request, request_options
-from ehadiag.result import Log, Result, load_result
+from ehadiag.result import Result, load_result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     counting_bar,
@@ -48,17 +48,14 @@ from ehadiag.terminal.output import (
     print_test_list,
     progress_bar,
     report_failure,
-    worst_exit_code,
 )
 from firmware_iface.errors import (
     ConfigurationError,
     EhadiagError,
-    InputOutputError,
     reason_of,
 )
 from firmware_iface.files import write_file
 from firmware_iface.logs.log_files import FRAME_READERS
-from firmware_iface.recording import Recording
 
 if TYPE_CHECKING:
     pass
@@ -77,8 +74,7 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
         f"Diagnose actuators from recordings of their bus ({' '.join(FRAME_READERS)}, and these as"
         " .gz)."
     )
-    parser.add_argument("logs", nargs="+", metavar="LOG", help=request_options()["logs"].help)
-    options.add_request_options(parser, "test", "joint", "every_test")
+    options.add_request_options(parser, "logs", "test", "joint", "every_test")
     parser.add_argument(
         "--list", action="store_true", help="list the tests that each log holds, diagnose none"
     )
@@ -129,12 +125,6 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     history = results.history.snapshot()
     if history is not None:  # a changed setup loads its files again
         setups = [replace(setup, history=history) for setup in setups]
-    print_compiling_notice()
-    if arguments.merge:
-        codes = {_diagnose_merged(setup, results, inputs) for setup in setups}
-        return worst_exit_code(codes) if len(codes) > 1 else codes.pop()
-    if arguments.joint:
-        return _diagnose_joint(setups[0], results, inputs)
     return BatchRun(arguments, setups, results, inputs).run()
 
 
@@ -160,45 +150,6 @@ def _output_files(arguments: argparse.Namespace) -> list[OutputFile]:
     return [OutputFile(option, name) for option, name in named if name]
 
 
-def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
-    """Make one estimate from all logs."""
-    together: list[Recording] = []
-    logs: list[Log | None] = []
-    read_s = 0.0
-    codes: list[int] = []
-    for item in inputs:
-        with report_failure(codes, EhadiagError), progress_bar() as progress:
-            reading = setup.read(_readable(item), progress=progress)
-            for recording, log in reading.each():
-                together.append(recording)
-                logs.append(log)
-            read_s += reading.seconds
-    if any(codes):
-        print_status("no joint estimate: not all of the logs could be read")
-        return exit_code_of_inputs(codes)
-    files = [item.name for item in inputs]
-    return diagnose_and_deliver(setup, results, together, files, logs, read_s, "joint")[1]
-
-
-def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
-    """Diagnose one recording that is split over several files."""
-    names = [_readable(item) for item in inputs]
-    with progress_bar() as progress:
-        reading = setup.read(*names, progress=progress)
-    codes = [
-        diagnose_and_deliver(setup, results, [recording], reading.files, [log], reading.seconds)[1]
-        for recording, log in reading.each()
-    ]
-    return worst_exit_code(codes)
-
-
-def _readable(item: LogInput) -> str:
-    """Name of an input; InputOutputError: it was found unreadable when the names were expanded."""
-    if item.why:
-        raise InputOutputError(item.why)
-    return item.name
-
-
 def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
     """Print the tests of one actuator in each log."""
     arguments, suffix = unit.arguments, f" ({unit.label})" if unit.label else ""
@@ -213,7 +164,7 @@ def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:
         with report_failure(codes, EhadiagError):
-            names = [_readable(item) for item in group]
+            names = [readable_name(item) for item in group]
             with progress_bar() as progress:
                 tests = list(list_tests(setup, *names, progress=progress))
             print_test_list(", ".join(names) + suffix, tests, as_json=arguments.json)

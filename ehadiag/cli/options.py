@@ -83,6 +83,9 @@ def add_request_options(
         option = request_options()[name]
         text = help or option.help
         settings: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
+        if not option.flag:
+            parser.add_argument(**settings, nargs="+", metavar="LOG")
+            continue
         if option.kind is bool:
             parser.add_argument(option.flag, action="store_true", **settings)
             continue
