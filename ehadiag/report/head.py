@@ -29,6 +29,7 @@ from firmware_iface.stored_test import bundled_tests
 if TYPE_CHECKING:
     from ehadiag.estimate import Effect, Severity
     from ehadiag.prognosis.units import Prognosis
+    from ehadiag.request import Request
     from ehadiag.result import Onboard, Result
 
 INCONCLUSIVE = "INCONCLUSIVE"
@@ -148,8 +149,11 @@ def verdict_word(verdict: str, *, identified: bool) -> str:
     return verdict.replace("_", " ")
 
 
-def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) -> Head:
-    """Return the content of a result's head."""
+def head_of(
+    result: Result, asked: Levels | None = None, prognosis: Prognosis | None = None
+) -> Head:
+    """Return the content of a result's head; `asked`: other levels than those of its request."""
+    levels = asked or result.request
     untested = result.verdict is Verdict.NOT_TESTED
     bars = sorted(
         (_bar(item, levels, untested) for item in result.as_shown.severities.values()),
@@ -248,7 +252,7 @@ def shown_date(date: str) -> str:
     return f"{date[:10]} {date[11:16]} UTC"
 
 
-def _bar(item: Severity, levels: Levels, untested: bool) -> Bar:
+def _bar(item: Severity, levels: Levels | Request, untested: bool) -> Bar:
     value, state, standing = item.estimate, "", "not known"
     if value is not None and untested:
         standing = "no verdict"
@@ -268,7 +272,7 @@ def _bar(item: Severity, levels: Levels, untested: bool) -> Bar:
     )
 
 
-def _found(result: Result, bars: Sequence[Bar], levels: Levels) -> tuple[str, ...]:
+def _found(result: Result, bars: Sequence[Bar], levels: Levels | Request) -> tuple[str, ...]:
     """Say what is worn, worst first, with what to do."""
     both = (levels.advisory, levels.limit)
     out = []
@@ -370,7 +374,7 @@ def diagnosis_html(result: Result) -> str:
     """Return a result as a piece of HTML for a notebook, its text escaped."""
     from ehadiag.report.page_parts import templates_of  # noqa: PLC0415 - bokeh is slow
 
-    head = head_of(result, Levels(result.request.advisory, result.request.limit))
+    head = head_of(result)
     template = templates_of("ehadiag.report").get_template("notebook.html.j2")
     shown = result.as_shown.severities
     severities = [shown[bar.symbol] for bar in head.bars]
@@ -385,7 +389,7 @@ def print_result(
     verbose: the course of the search, reasons in terms of the field, numbers beside no verdict, and
     every effect that was estimated, not only those that are not 0 beyond doubt.
     """
-    head = head_of(result, Levels(result.request.advisory, result.request.limit), prognosis)
+    head = head_of(result, prognosis=prognosis)
     _print_head(head, result, console)
     if verbose:
         for reason in result.reasons:

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Self
 import msgspec
 from msgspec.structs import replace
 
-from ehadiag.assess.verdict import Levels
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import finite, utc_text
 from ehadiag.estimate import Severity
@@ -233,7 +232,7 @@ class BitView:
         result = self._result
         if result is None:
             return None
-        head = head_of(result, Levels(result.request.advisory, result.request.limit))
+        head = head_of(result)
         return Ending(verdict=head.word, reasons=head.lines)
 
     def _serial(self) -> int | None:

@@ -264,6 +264,7 @@ def test_the_environment_is_the_median_over_the_test() -> None:
         time_ns=100_000_000 * row,
         data=np.arange(40, dtype=np.uint8).reshape(5, 8),
         counter=None,
+        modulus=0,
         stream=np.zeros(5, dtype=np.int64),
         values={
             "environment.supply_pressure": np.array([1.0, 20.0, 30.0, NAN, 90.0]),

@@ -89,6 +89,8 @@ def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(pages, senders):
         data=np.arange(8 * count, dtype=np.uint8).reshape(count, 8),
         time_ns=np.arange(count) * 50_000_000,
         counter=np.arange(count) * 101 % 256,
+        modulus=256,
+        counted=None,
         values={"environment.oil_temperature": np.full(count, 40.0)},
     )
     assert len(slow_values(frames, 0, count, 3_000_000_000)[1]) == senders
