@@ -108,7 +108,7 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
 
 
 def _print_calibrated(found: Calibrated, *, as_json: bool) -> None:
-    from ehadiag.report.result_tables import calibration_json, print_calibration  # noqa: PLC0415
+    from ehadiag.report.calibration_tables import calibration_json, print_calibration  # noqa: PLC0415
 
     if as_json:
         write_output(calibration_json(found) + "\n")
@@ -389,7 +389,7 @@ def _write_test(path: Path, content: bytes) -> None:
 def _print_scores(
     arguments: argparse.Namespace, found: list[tuple[StoredTest, Score]], written: str | None
 ) -> None:
-    from ehadiag.report.result_tables import DESIGN_SCHEMA, print_score, score_tree  # noqa: PLC0415
+    from ehadiag.report.calibration_tables import DESIGN_SCHEMA, print_score, score_tree  # noqa: PLC0415
 
     if not arguments.json:
         for test, scored in found:

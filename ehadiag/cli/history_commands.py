@@ -32,8 +32,11 @@ from ehadiag.history.records import (
     MaintenanceEvent,
     counted_entries,
     current_utc_text,
+    entries_from_csv,
     entry_object,
     event_object,
+    history_csv,
+    history_parquet,
     of_unit,
 )
 from ehadiag.model.severities import FAULT_LAWS
@@ -223,8 +226,6 @@ def _show(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.tables import history_csv, history_parquet  # noqa: PLC0415
-
     entries, _ = _read(arguments)
     if arguments.out is None:
         write_output(history_csv(entries))
@@ -237,8 +238,6 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.tables import entries_from_csv  # noqa: PLC0415
-
     # A million rows.
     content = read_small_file(Path(arguments.file), 200_000_000, "table")
     try:
