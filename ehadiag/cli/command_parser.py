@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from firmware_iface.errors import ConfigurationError, printable, reason_of
-from firmware_iface.files import read_toml, refuse_foreign
 
 FORMER_OPTIONS = {
     "--serial": "--port URL for a serial port, --unit N for the unit",
@@ -316,6 +315,8 @@ def apply_defaults(
     variables = list(_variables())
     if not files and not variables:
         return AppliedDefaults((), ())
+    from firmware_iface.files import read_toml  # noqa: PLC0415 - not for help texts
+
     chosen = CalledOptions(parser, given)
     known = {name: option_keys(item) for name, item in commands().items()}
     used: list[str] = []
@@ -425,6 +426,8 @@ def _relative_to_file(path: Path, key: str, value: Any) -> Any:
 
 def _refuse_foreign_file(path: Path, where: str) -> None:
     """Refuse a file that others may have written: it could change a verdict."""
+    from firmware_iface.files import refuse_foreign  # noqa: PLC0415 - not for help texts
+
     try:
         info = path.stat()
         if hasattr(os, "getuid") and info.st_uid == 0 and not info.st_mode & stat.S_IWOTH:
