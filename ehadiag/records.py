@@ -339,13 +339,8 @@ def hash_of_samples(recording: Recording) -> str | None:
     out = hashlib.sha256(
         f"{recording.test_id} {recording.serial} {samples.period_ns} {samples.mode}".encode()
     )
-    for values in (
-        samples.command,
-        samples.current,
-        samples.spool,
-        samples.pressure,
-        samples.position,
-    ):
+    measured = samples.current, samples.spool, samples.pressure, samples.position
+    for values in (samples.command, *measured):
         # One zero, one NaN: equal numbers have equal bits.
         plain = np.where(np.isnan(values), np.nan, values + 0.0)
         out.update(plain.astype("<f8").tobytes())

@@ -48,13 +48,8 @@ def is_complete_recording(recording: Recording, test: StoredTest) -> bool:
     if recording.outcome.state is not BitState.COMPLETE:
         return False
     end = slice(-round(RECORDING.max_frame_delay_s * test.rate) or None, None)
-    for values in (
-        samples.current,
-        samples.spool,
-        samples.pressure,
-        samples.position,
-        samples.command,
-    ):
+    measured = samples.current, samples.spool, samples.pressure, samples.position
+    for values in (*measured, samples.command):
         seen = np.isfinite(values)
         if seen.any() and not seen[end].all():
             return False
