@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ehadiag.core.actuator import WEAR_EXCESS_FACTOR, Calibration
+from ehadiag.core.actuator import WEAR_EXCESS_FACTOR
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import FIT, VERDICT
-from ehadiag.identify.identification_result import Fit, Identification
 from firmware_iface.errors import ConfigurationError
 
 if TYPE_CHECKING:  # the command line needs levels and codes long before it loads the compiler
-    from ehadiag.identify.identification_result import Estimate, Identification
+    from ehadiag.core.actuator import Calibration
+    from ehadiag.identify.identification_result import Estimate, Fit, Identification
 
 
 class Verdict(IntEnum):

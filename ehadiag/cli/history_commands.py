@@ -23,7 +23,7 @@ from ehadiag.cli.options import (
     user_history_path,
 )
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
-from ehadiag.core.conventions import utc_time_text
+from ehadiag.core.conventions import shown_date, utc_time_text
 from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.history.records import (
     DIAGNOSIS_TABLE,
@@ -40,7 +40,6 @@ from ehadiag.history.records import (
     of_unit,
 )
 from ehadiag.model.severities import FAULT_LAWS
-from ehadiag.report.head import shown_date
 from ehadiag.report.rendering import isolated_png
 from ehadiag.terminal.output import (
     print_status,

@@ -136,3 +136,8 @@ FALSE_ALARM_INTERVAL_H: Final = 100.0
 def finite(value: float | None) -> float | None:
     """Return a number as results hold it: None for NaN and the infinite."""
     return None if value is None or not math.isfinite(value) else float(value)
+
+
+def shown_date(date: str) -> str:
+    """Return a date of a result, UTC and ISO 8601, as people read it."""
+    return f"{date[:10]} {date[11:16]} UTC"

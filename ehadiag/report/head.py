@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ehadiag.assess.verdict import Levels, Verdict
-from ehadiag.core.conventions import PIPE_COLUMNS, display_unit, to_precision
+from ehadiag.core.conventions import PIPE_COLUMNS, display_unit, shown_date, to_precision
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN
 from firmware_iface.errors import printable
 from firmware_iface.stored_test import bundled_tests
@@ -245,11 +245,6 @@ def advised(advice: str, *, at_once: bool) -> str:
     if not advice:
         return ""
     return f"Act now: {advice}." if at_once else f"Plan to {advice}."
-
-
-def shown_date(date: str) -> str:
-    """Return a date of a result, UTC and ISO 8601, as people read it."""
-    return f"{date[:10]} {date[11:16]} UTC"
 
 
 def _bar(item: Severity, levels: Levels | Request, untested: bool) -> Bar:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from msgspec import structs
 
 from ehadiag.assess.verdict import Levels, Verdict
-from ehadiag.core.conventions import MAX_RESULT_BYTES
+from ehadiag.core.conventions import MAX_RESULT_BYTES, shown_date
 from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, MaintenanceEvent, counted_entries, of_unit
 from ehadiag.history.store import History
@@ -27,7 +27,6 @@ from ehadiag.report.head import (
     full_name,
     percent,
     plain_name,
-    shown_date,
     verdict_word,
 )
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of

@@ -32,7 +32,6 @@ from ehadiag.live import (
     publish,
 )
 from ehadiag.records import log_of
-from ehadiag.report.head import head_of
 from ehadiag.setup import Deadline, Setup
 from firmware_iface.bus_map import BusMap
 from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name
@@ -232,6 +231,8 @@ class BitView:
         result = self._result
         if result is None:
             return None
+        from ehadiag.report.head import head_of  # noqa: PLC0415 - loads what prints
+
         head = head_of(result)
         return Ending(verdict=head.word, reasons=head.lines)
 
