@@ -15,11 +15,6 @@ AT_BOUND, NOT_SHOWN = "at_bound", "not_shown"
 """Flags: the estimate stands at a bound; the test does not show this severity."""
 
 
-def finite(value: float | None) -> float | None:
-    """Return a number as results hold it: None for NaN and the infinite."""
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
 class Severity(msgspec.Struct, frozen=True, kw_only=True):
     """Severity of one progressive fault: 0 as new, 1 at the limit of damage.
 

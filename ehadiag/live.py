@@ -16,7 +16,8 @@ from typing import Any
 
 import msgspec
 
-from ehadiag.estimate import Severity, finite
+from ehadiag.core.conventions import finite
+from ehadiag.estimate import Severity
 from firmware_iface.errors import printable
 from firmware_iface.recording import CommandMode
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, cast
@@ -11,8 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.core.conventions import __version__, date_text, fingerprint
-from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity, finite
+from ehadiag.core.conventions import __version__, date_text, fingerprint, finite
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity
 from ehadiag.request import Request
 from ehadiag.result import (
     Configuration,
@@ -20,6 +21,7 @@ from ehadiag.result import (
     InputError,
     LevelsPart,
     Log,
+    Mapped,
     Onboard,
     OnboardFault,
     Origin,
@@ -138,6 +140,26 @@ def failed_result(
     )
 
 
+def sources_of(
+    tests: object, columns: object, mapping: object, dbc: str, file: str | None, solver: str | None
+) -> Sources:
+    """Return the fingerprints of what a request names.
+
+    columns: meaning of decoded signals; None: by their names; mapping: meaning of the frames, of
+    the DBC `dbc` and the mapping file `file`; solver: name of one that was given as an object.
+    """
+    return Sources(
+        tests_sha256=fingerprint(tests),
+        columns_sha256=None if columns is None else fingerprint(columns),
+        mapping=Mapped(
+            name=valid_text(dbc),
+            sha256=fingerprint(mapping),
+            file=None if file is None else valid_text(file),
+        ),
+        solver=solver,
+    )
+
+
 def configuration_of(request: Request, sources: Sources) -> Configuration:
     """Return all that decides results but actuator data and recordings."""
     names = {item.name for item in msgspec.structs.fields(Configuration)}
@@ -179,35 +201,33 @@ def _printable(request: Request) -> Request:
         for name in request.__struct_fields__
         if isinstance(value := getattr(request, name), str | tuple)
     }
-    return msgspec.structs.replace(request, **texts)
+    changed = any(value != getattr(request, name) for name, value in texts.items())
+    return msgspec.structs.replace(request, **texts) if changed else request
 
 
 def _severities(found: Identification | None, actuator: Actuator) -> dict[str, Severity]:
     """Every fault of the registry, in its order."""
-    from ehadiag.model.registry import FAULTS, parameter  # noqa: PLC0415 - loads kernels
+    from ehadiag.model.registry import FAULTS  # noqa: PLC0415 - loads kernels
 
-    advice = {item.name: getattr(actuator.advice, item.name) for item in FAULTS}
-    if found is None:
-        return {
-            item.name: Severity(name=item.name, meaning=item.short, advice=advice[item.name])
-            for item in FAULTS
-        }
-    out = {}
-    for item in found.estimates:
+    out = {
+        item.name: Severity(
+            name=item.name, meaning=item.short, advice=getattr(actuator.advice, item.name)
+        )
+        for item in FAULTS
+    }
+    for item in found.estimates if found else ():
         ends = (finite(item.interval95[0]), finite(item.interval95[1]))
-        out[item.name] = Severity(
-            name=item.name,
+        out[item.name] = msgspec.structs.replace(
+            out[item.name],
             first=finite(item.first),
             search=finite(item.search),
             estimate=finite(item.value),
             std=finite(item.std),
             interval95=None if ends[0] is None or ends[1] is None else (ends[0], ends[1]),
             flags=(AT_BOUND,) * item.at_bound + (NOT_SHOWN,) * (not item.shown),
-            meaning=parameter(item.name).short,
-            advice=advice[item.name],
             source="final",
         )
-    return {item.name: out[item.name] for item in FAULTS}
+    return out
 
 
 def _fit(found: Identification | None) -> Fit | None:
@@ -319,13 +339,8 @@ def hash_of_samples(recording: Recording) -> str | None:
     out = hashlib.sha256(
         f"{recording.test_id} {recording.serial} {samples.period_ns} {samples.mode}".encode()
     )
-    for values in (
-        samples.command,
-        samples.current,
-        samples.spool,
-        samples.pressure,
-        samples.position,
-    ):
+    measured = samples.current, samples.spool, samples.pressure, samples.position
+    for values in (samples.command, *measured):
         # One zero, one NaN: equal numbers have equal bits.
         plain = np.where(np.isnan(values), np.nan, values + 0.0)
         out.update(plain.astype("<f8").tobytes())
@@ -350,4 +365,18 @@ def _onboard(found: OnboardResult | None) -> Onboard | None:
             name: OnboardFault(estimate=finite(value), std=finite(found.std[name]))
             for name, value in found.severities.items()
         },
+    )
+
+
+def log_of(path: str | os.PathLike[str]) -> Log | None:
+    """What can be said of a log without reading it; None where there is none."""
+    try:
+        info = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return Log(
+        path=valid_text(os.path.abspath(os.fspath(path))),
+        bytes=info.st_size,
+        modified=date_text(info.st_mtime_ns),
+        modified_ns=info.st_mtime_ns,
     )

@@ -497,7 +497,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     def __str__(self) -> str:
         """Return the command line's table."""
-        from ehadiag.report.result_tables import diagnosis_text  # noqa: PLC0415 - only who prints needs rich
+        from ehadiag.report.head import diagnosis_text  # noqa: PLC0415 - only who prints needs rich
 
         return diagnosis_text(self)
 
@@ -507,7 +507,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         return f"<Result {self.verdict.name} {self.source}: {values}>"
 
     def _repr_html_(self) -> str:
-        from ehadiag.report.result_tables import diagnosis_html  # noqa: PLC0415
+        from ehadiag.report.head import diagnosis_html  # noqa: PLC0415
 
         return diagnosis_html(self)
 

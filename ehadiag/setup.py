@@ -17,12 +17,12 @@ from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator, with_tolerance
-from ehadiag.core.conventions import date_text, fingerprint
+from ehadiag.core.conventions import fingerprint
 from ehadiag.core.interruption import COMPUTING_THREAD_NAME
 from ehadiag.estimate import Severity
-from ehadiag.records import failed_result, result_of
+from ehadiag.records import failed_result, log_of, result_of, sources_of
 from ehadiag.request import Request
-from ehadiag.result import Log, Mapped, Origin, Result, Sources, load_result
+from ehadiag.result import Log, Origin, Result, Sources, load_result
 from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, EhadiagError, NotTestedError, valid_text
 from firmware_iface.find_test import CandidateTests
@@ -311,17 +311,9 @@ class Setup:
     def sources(self) -> Sources:
         """Fingerprints of what the request names."""
         tests = (self.default,) if self.default else self.tests
-        file = self.request.mapping
-        return Sources(
-            tests_sha256=fingerprint(tests),
-            columns_sha256=None if self.columns is None else fingerprint(self.columns),
-            mapping=Mapped(
-                name=valid_text(self.bus_map.name),
-                sha256=fingerprint(self.bus_map),
-                file=None if file is None else valid_text(file),
-            ),
-            solver=self.solver.name if "solver" in self.objects else None,
-        )
+        solver = self.solver.name if "solver" in self.objects else None
+        names = self.bus_map.name, self.request.mapping
+        return sources_of(tests, self.columns, self.bus_map, *names, solver)
 
     @cached_property
     def prior(self) -> Result | None:
@@ -408,7 +400,7 @@ class Setup:
         files: files to read; several hold one recording; progress: called with the stage and the
         share of a file that is read. Returns at least one recording, and the time that it took.
         """
-        from firmware_iface.logs.reader import choose_recording  # noqa: PLC0415 - loads cantools
+        from firmware_iface.signals.recordings import choose_recording  # noqa: PLC0415 - loads cantools
 
         begin = time.perf_counter()
         tests = self.open(*files, progress=progress)
@@ -553,20 +545,6 @@ class Setup:
 
         tests = match_tests(recordings, self.tests, self.default)
         return not_tested(recordings, tests, self.actuator, [why], elapsed)
-
-
-def log_of(path: PathLike) -> Log | None:
-    """What can be said of a log without reading it; None where there is none."""
-    try:
-        info = os.stat(path)
-    except (OSError, ValueError):
-        return None
-    return Log(
-        path=valid_text(os.path.abspath(os.fspath(path))),
-        bytes=info.st_size,
-        modified=date_text(info.st_mtime_ns),
-        modified_ns=info.st_mtime_ns,
-    )
 
 
 def _silent(_stage: str, _share: float) -> None:

@@ -173,7 +173,7 @@ def _message(item: Decoded, table: FrameTable, conflicts: int) -> MessageReport:
 def _lost(item: Decoded) -> int | None:
     if item.counter is None:
         return None
-    modulus = item.message.modulus
+    modulus = item.modulus
     step = np.diff(item.counter) % modulus
     missing = int((step[(step > 1) & (step <= modulus // 2)] - 1).sum())
     return max(missing - len(item.crc_bad) - len(item.length_bad), 0)

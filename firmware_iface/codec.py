@@ -92,6 +92,10 @@ class Decoded(msgspec.Struct, frozen=True, eq=False):
     """Host time, shape (n,)."""
     counter: IntArray | None
     """Counter values, shape (n,); None without a counter."""
+    modulus: int
+    """Counts per turn of the counter; 0 without one."""
+    counted: BoolArray | None
+    """Which frames carry the counter, shape (n,); None: all of them, or there is none."""
     values: Mapping[str, FloatArray]
     """SI value per role, shape (n,); NaN where a multiplexed signal is absent or its value lies
     outside the range of the DBC.
@@ -110,6 +114,7 @@ class Decoded(msgspec.Struct, frozen=True, eq=False):
             data=self.data[keep],
             time_ns=self.time_ns[keep],
             counter=None if self.counter is None else self.counter[keep],
+            counted=None if self.counted is None else self.counted[keep],
             values={name: value[keep] for name, value in self.values.items()},
             saturated={name: value[keep] for name, value in self.saturated.items()},
             stream=self.stream[keep],
@@ -120,6 +125,10 @@ class DecodedTable(msgspec.Struct, frozen=True, eq=False):
     """All messages of a frame table; rows of frames that belong to none, and of error frames."""
 
     messages: Mapping[str, Decoded]
+    message_of: Mapping[str, str]
+    """Name of the message that brings each role, as `command.mode`."""
+    onboard: IntArray
+    """Rows of what the computer has found by itself, ascending."""
     foreign: IntArray
     errors: IntArray
 
@@ -128,7 +137,9 @@ def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
     """Check and decode all frames of the mapped messages on the actuator's channel."""
     foreign = ~(table.error | table.remote)
     messages = {}
+    message_of: dict[str, str] = {}
     for message in bus_map.messages.values():
+        message_of |= {role.name: message.name for role in message.roles}
         mine = rows_of(table, message)
         if bus_map.channel is not None:
             channel = table.channel[mine]
@@ -141,9 +152,14 @@ def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
             bus_map.policy.crc == "flag",
             bus_map.policy.range == "flag",
         )
+    onboard = np.zeros_like(foreign)
     for message in bus_map.onboard:
-        foreign[rows_of(table, message)] = False
-    return DecodedTable(messages, np.flatnonzero(foreign), np.flatnonzero(table.error))
+        onboard[rows_of(table, message)] = True
+    foreign &= ~onboard
+    if bus_map.channel is not None:
+        onboard &= (table.channel == bus_map.channel) | (table.channel == 0)
+    rows = map(np.flatnonzero, (onboard, foreign, table.error))
+    return DecodedTable(messages, message_of, *rows)
 
 
 def _decode_message(
@@ -184,6 +200,8 @@ def _decode_message(
         data=data,
         time_ns=table.time_ns[row],
         counter=_integers(message.counter, data),
+        modulus=message.modulus,
+        counted=None if message.counter is None else message.counter.present(data),
         values=values,
         saturated=saturated,
         stream=stream,

@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cached_property
 from importlib.util import find_spec
 from itertools import islice
 from typing import Any, Literal
@@ -25,7 +26,7 @@ WORD_BITS = 64
 PIECE_BITS = 32
 
 
-class SignalLayout(msgspec.Struct, frozen=True):
+class SignalLayout(msgspec.Struct, frozen=True, dict=True):
     """Place and number format of one signal."""
 
     name: str
@@ -51,7 +52,7 @@ class SignalLayout(msgspec.Struct, frozen=True):
     selectors: tuple[tuple[SignalLayout, frozenset[int]], ...] = ()
     """Multiplexers that must all hold one of their values for the signal to be present."""
 
-    @property
+    @cached_property
     def lead(self) -> int:
         """Bits before the signal: from bit 0 of byte 0, or from the payload's first (top) bit."""
         if self.big_endian:

@@ -12,12 +12,20 @@ from typing import NamedTuple
 
 import msgspec
 
-from firmware_iface.bus_map import BusMap, MessageMap, Role, default_map
+from firmware_iface.bus_map import ONBOARD_SEVERITIES, BusMap, MessageMap, Role, default_map
 from firmware_iface.codec import value_ends
 from firmware_iface.dbc import FLOAT_FORMATS, SignalLayout
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.protection import SenderWatch, intact
-from firmware_iface.recording import CHANNEL_NAMES, CHANNEL_ROLES, BitReason, BitState, CommandMode
+from firmware_iface.recording import (
+    CHANNEL_NAMES,
+    CHANNEL_ROLES,
+    BitReason,
+    BitState,
+    CommandMode,
+    OnboardResult,
+    OnboardState,
+)
 from firmware_iface.slow_values import SlowValueWatch, brings_slow_values
 from firmware_iface.transport.frames import Frame
 
@@ -442,3 +450,74 @@ def _channel_ends(message: MessageMap, key: str) -> tuple[float, float]:
     role = next(item for item in message.roles if item.name == key)
     low, high = sorted(end * role.gain + role.bias for end in value_ends(role.signal))
     return low, high
+
+
+BUSY_ONBOARD_STATES = (OnboardState.RECORDING, OnboardState.IDENTIFYING)
+
+
+class OnboardReader:
+    """Puts a result together of its messages, in order of arrival.
+
+    The severities count that come while the computer says that it is done.
+
+    result: the last whole result; None when a later test has begun.
+    """
+
+    result: OnboardResult | None
+
+    def __init__(self, bus_map: BusMap) -> None:
+        self._messages = {(item.can_id, item.extended): item for item in bus_map.onboard}
+        self._state: int | None = None
+        self._progress: dict[str, float] = {}
+        self._values: dict[str, float] = {}
+        self.result = None
+
+    @property
+    def awaited(self) -> bool:
+        """Whether the computer is about to find something, or has and not yet said all of it."""
+        return self._state in BUSY_ONBOARD_STATES or (
+            self._state == OnboardState.DONE and self.result is None
+        )
+
+    def of_test(self, test_id: int | None) -> OnboardResult | None:
+        """Return the result if it can be that of a test; None: the number is not known."""
+        found = self.result
+        return found if found is not None and found.is_of(test_id) else None
+
+    def take(self, frame: Frame) -> None:
+        """Take any frame."""
+        if not (frame.error or frame.remote):
+            self.take_payload(frame.can_id, frame.extended, frame.data)
+
+    def take_payload(self, can_id: int, extended: bool, data: bytes) -> None:
+        """Take the payload of a data frame."""
+        message = self._messages.get((can_id, extended))
+        values = None if message is None else checked_values(message, data)
+        if values is not None:
+            self._take_values(
+                {name.removeprefix("onboard."): value for name, value in values.items()}
+            )
+
+    def _take_values(self, values: Mapping[str, float]) -> None:
+        if "state" in values:
+            self._state = round(values["state"])
+            if values != self._progress:
+                self._values, self.result, self._progress = {}, None, dict(values)
+        if self._state != OnboardState.DONE:
+            return
+        self._values |= values
+        if self.result is None and all(
+            name in self._values for key in ONBOARD_SEVERITIES for name in (key, f"std_{key}")
+        ):
+            std = {key: self._values[f"std_{key}"] for key in ONBOARD_SEVERITIES}
+            # A deviation of 0 says that the computer has no estimate.
+            self.result = OnboardResult(
+                test_id=self._number("test_id"),
+                verdict=self._number("verdict"),
+                runs=self._number("runs"),
+                severities={k: self._values[k] if std[k] > 0.0 else math.nan for k in std},
+                std={k: value if value > 0.0 else math.nan for k, value in std.items()},
+            )
+
+    def _number(self, key: str) -> int | None:
+        return round(self._values[key]) if key in self._values else None

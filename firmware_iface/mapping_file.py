@@ -6,75 +6,7 @@ from typing import Annotated, Literal, get_args
 
 import msgspec
 
-from firmware_iface.errors import ConfigurationError
 from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID
-
-UNIT_SCALES: dict[str, dict[str, tuple[float, float]]] = {
-    "current": {"A": (1.0, 0.0), "mA": (1e-3, 0.0), "uA": (1e-6, 0.0)},
-    "length": {
-        "m": (1.0, 0.0),
-        "cm": (1e-2, 0.0),
-        "mm": (1e-3, 0.0),
-        "um": (1e-6, 0.0),
-        "in": (0.0254, 0.0),
-        "mil": (25.4e-6, 0.0),
-    },
-    "pressure": {
-        "Pa": (1.0, 0.0),
-        "hPa": (1e2, 0.0),
-        "kPa": (1e3, 0.0),
-        "MPa": (1e6, 0.0),
-        "mbar": (1e2, 0.0),
-        "bar": (1e5, 0.0),
-        "psi": (6894.757293168361, 0.0),
-    },
-    # Temperatures are kept in degC, the scale of the viscosity laws.
-    "temperature": {
-        "degC": (1.0, 0.0),
-        "C": (1.0, 0.0),
-        "K": (1.0, -273.15),
-        "degF": (5.0 / 9.0, -160.0 / 9.0),
-    },
-    "time": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0)},
-}
-"""Per dimension: unit text -> (gain, bias), SI value = gain * value + bias."""
-
-UNIT_SPELLINGS = {
-    "µA": "uA",
-    "μA": "uA",
-    "µm": "um",
-    "μm": "um",
-    "µs": "us",
-    "μs": "us",
-    "°C": "degC",
-    "°F": "degF",
-    "deg C": "degC",
-    "deg F": "degF",
-    "inch": "in",
-    "Volts": "V",
-    "sec": "s",
-    "msec": "ms",
-}
-
-
-def si_factor(text: str, dimension: str, where: str) -> tuple[float, float]:
-    """Gain and bias of a unit: SI value = gain · value + bias.
-
-    text: the unit as written; dimension: quantity that it must measure, a key of `UNIT_SCALES`;
-    where: beginning of the error message. ConfigurationError: no unit, or not one of the dimension.
-    """
-    known = UNIT_SCALES[dimension]
-    unit = UNIT_SPELLINGS.get(text.strip(), text.strip())
-    if unit in known:
-        return known[unit]
-    if not unit:
-        raise ConfigurationError(
-            f"{where}: the DBC gives no unit; add unit = … ({', '.join(known)}) to the mapping"
-        )
-    raise ConfigurationError(
-        f"{where}: unit {text.strip()!r} is no {dimension} (known: {', '.join(known)})"
-    )
-
 
 MappingName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 CanIdentifier = Annotated[int, msgspec.Meta(ge=0, le=MAX_CAN_ID)]
@@ -114,6 +46,11 @@ class ChannelSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position: ChannelRef
 
 
+COMMAND_MODES: dict[Literal["current", "position"], CodeNumber] = {"current": 1, "position": 2}
+REQUEST_CODES: dict[Literal["start", "abort"], CodeNumber] = {"start": 1, "abort": 2}
+"""Numbers on the bus, unless a mapping says others."""
+
+
 class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the computer commands; at least one of current and position."""
 
@@ -122,7 +59,7 @@ class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mode: SignalRef | None = None
     test_id: SignalRef | None = None
     modes: dict[Literal["current", "position"], CodeNumber] = msgspec.field(
-        default_factory=lambda: {"current": 1, "position": 2}
+        default_factory=COMMAND_MODES.copy
     )
 
 
@@ -143,7 +80,7 @@ class StatusSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     elapsed: SignalRef | None = None
     serial: SignalRef | None = None
     states: dict[BitStateName, CodeNumber] = msgspec.field(
-        default_factory=lambda: {name: number for number, name in enumerate(get_args(BitStateName))}
+        default_factory={name: number for number, name in enumerate(get_args(BitStateName))}.copy
     )
 
 
@@ -153,7 +90,7 @@ class RequestSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: SignalRef | None = None
     test_id: SignalRef | None = None
     codes: dict[Literal["start", "abort"], CodeNumber] = msgspec.field(
-        default_factory=lambda: {"start": 1, "abort": 2}
+        default_factory=REQUEST_CODES.copy
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from enum import IntEnum
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
@@ -28,7 +29,7 @@ DEFAULT_LEVELS: Final = 4096.0
 """Codes of the 12-bit converters of PHY-21."""
 
 
-class Channel(msgspec.Struct, frozen=True):
+class Channel(msgspec.Struct, frozen=True, dict=True):
     """One converter channel: mid-tread rounding, saturating at its ends."""
 
     name: str
@@ -42,7 +43,7 @@ class Channel(msgspec.Struct, frozen=True):
     levels: float = DEFAULT_LEVELS
     """Steps in the whole range; no whole number where the step was seen in data."""
 
-    @property
+    @cached_property
     def lsb(self) -> float:
         """One code step, SI unit."""
         return 2.0 * self.full_scale / self.levels
@@ -52,7 +53,7 @@ class Channel(msgspec.Struct, frozen=True):
         """Code of zero; the largest code is 2 half - 1."""
         return round(0.5 * self.levels)
 
-    @property
+    @cached_property
     def grain(self) -> float:
         """Step of a 12-bit converter of this range, or its own where that is coarser, SI unit.
 

@@ -140,6 +140,7 @@ def slow_value_conflict(
     message: MessageMap,
     time_ns: IntArray,
     counter: IntArray | None,
+    modulus: int,
     values: Mapping[str, FloatArray],
     span_ns: int,
     *,
@@ -149,8 +150,8 @@ def slow_value_conflict(
 
     message: the message; time_ns: time stamps of its sound frames in order of arrival without
     repeats, shape (n,); counter: their counters, shape (n,); None where not each of them has one;
-    values: SI values by role, shape (n,); span_ns: time, ns, in which they were sent; steady: see
-    `spread_conflict`. Returns one clause that names the message.
+    modulus: counts per turn; values: SI values by role, shape (n,); span_ns: time, ns, in which
+    they were sent; steady: see `spread_conflict`. Returns one clause that names the message.
     """
     who = f"a second sender of {message.name} ({message.can_id:#x})"
     cycle = message.cycle_ns if brings_slow_values(message) else 0
@@ -162,10 +163,10 @@ def slow_value_conflict(
         )
     if counter is not None:
         step = np.diff(counter)
-        leaps = _leaps(step, message.modulus)
+        leaps = _leaps(step, modulus)
         if cycle:  # a long silence is no leap
             waited = np.rint(np.diff(time_ns) / cycle).astype(np.int64)
-            leaps &= _leaps(step - waited, message.modulus)
+            leaps &= _leaps(step - waited, modulus)
         if leaps.sum() > CONFLICTS.chance:
             return f"{who}, two counters in turn: {leaps.sum()} of {len(step)} steps do not run on"
     for role, value in values.items():
@@ -215,6 +216,7 @@ class SlowValueWatch:
             self._message,
             stamps,
             np.array([item.counter for item in frames]) if counts and counter is not None else None,
+            self._message.modulus,
             {key: np.array([item.values[key] for item in frames]) for key in values},
             int(np.ptp(stamps)) + SLOW_VALUES.late_ns,
             steady=False,

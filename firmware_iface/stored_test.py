@@ -7,6 +7,7 @@ each stage of the diagnosis uses. A rig's computer may store others: a test is a
 from __future__ import annotations
 
 import itertools
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -109,7 +110,7 @@ class SearchWindows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refinement: SearchSpans
 
 
-class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, dict=True):
     """One stored test of a flight-control computer."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
@@ -127,12 +128,12 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         """Length, s."""
         return self.segment[-1].end
 
-    @property
+    @cached_property
     def ticks(self) -> int:
         """Number of control ticks."""
         return round(self.duration * self.rate)
 
-    @property
+    @cached_property
     def closed_loop(self) -> bool:
         """Whether the command is a position."""
         return self.mode == "position"

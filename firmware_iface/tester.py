@@ -13,15 +13,14 @@ import msgspec
 from msgspec.structs import replace
 
 from firmware_iface.alignment.align import assemble
-from firmware_iface.alignment.status import OnboardReader
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.errors import BusLostError, ConfigurationError, EhadiagError
 from firmware_iface.handshake import ChannelLimits, Handshake, HandshakeAction, Phase, TimeLimits
-from firmware_iface.live_decode import BitRequest, BitStatus, LiveDecoder, Sample
-from firmware_iface.logs.reader import choose_recording
+from firmware_iface.live_decode import BitRequest, BitStatus, LiveDecoder, OnboardReader, Sample
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.recording import BitOutcome, OnboardResult, Recording
+from firmware_iface.signals.recordings import choose_recording
 from firmware_iface.transport.base import FrameSource, Transport, open_source
 from firmware_iface.transport.frames import ColumnBuilder, Frame, FrameTable, concatenate
 

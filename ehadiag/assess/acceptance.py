@@ -1,22 +1,30 @@
-"""Whether a recording, and what was identified from it, can carry a verdict at all."""
+"""Whether a recording, and the actuator file that it is judged by, can carry a verdict at all.
+
+Relations between channels hold on any motion, whatever the faults: a wrong unit or sign shows,
+and so does a jack that does not travel as the spool's flow makes it, or a sensor that reads many
+times what the actuator can do. An actuator file whose ratios are far from those of any built
+actuator is refused too: a search would take minutes and explain the recording by no severities.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.plausibility import objections_to_readings
-from ehadiag.core.actuator import WEAR_EXCESS_FACTOR, Actuator, Calibration
-from ehadiag.core.conversion import conversion_of
-from ehadiag.core.criteria import FIT, LOSSES, READINGS, RECORDING
+from ehadiag.assess.response_checks import TRAVEL_SPAN_S, median_of_three
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import actuator_channels, conversion_of, largest_value
+from ehadiag.core.criteria import LOSSES, READINGS, RECORDING, RESPONSE
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.identification_result import Fit, Identification
-from ehadiag.identify.prior import has_further_effects
 from ehadiag.identify.signals import COMMAND_FRAME_TOLERANCE
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
 from firmware_iface.recording import (
+    CHANNELS,
     BitState,
     CommandMode,
     Environment,
@@ -40,13 +48,8 @@ def is_complete_recording(recording: Recording, test: StoredTest) -> bool:
     if recording.outcome.state is not BitState.COMPLETE:
         return False
     end = slice(-round(RECORDING.max_frame_delay_s * test.rate) or None, None)
-    for values in (
-        samples.current,
-        samples.spool,
-        samples.pressure,
-        samples.position,
-        samples.command,
-    ):
+    measured = samples.current, samples.spool, samples.pressure, samples.position
+    for values in (*measured, samples.command):
         seen = np.isfinite(values)
         if seen.any() and not seen[end].all():
             return False
@@ -263,73 +266,6 @@ def objection_to_current(experiment: Experiment) -> str:
     )
 
 
-def objections_to_estimate(
-    identification: Identification, calibration: Calibration | None = None
-) -> list[str]:
-    """Why estimates cannot carry a verdict; empty if they can.
-
-    calibration: of the unit: what it could not explain is no reason.
-    """
-    fit = identification.fit
-    out = []
-    rms = fit.unexplained_rms
-    most_outliers, most_rms = residual_limits(calibration)
-    if fit.unexplained_outliers > most_outliers or not rms <= most_rms:
-        out.append(
-            f"the model does not explain the recording: {fit.unexplained_outliers:.1%} of the "
-            f"residuals beyond three times the noise (limit {most_outliers:.1%}), rms residual "
-            f"{rms:.2f} (limit {most_rms:.3g}): other actuator data, or an effect that the three "
-            "faults leave out"
-        )
-    if identification.ambiguous and not out:
-        out.append(
-            "searches with all effects of the unit leave more than noise in closed loop, where"
-            " friction and hysteresis look alike: record the open-loop test, too"
-        )
-    if identification.better_exponent is not None:
-        out.append(
-            "the recording contradicts servovalve.clogging_exponent: with"
-            f" {identification.better_exponent:g} far more of it is explained"
-        )
-    if out and identification.exponent_doubted:
-        out.append("the recording does not bear out servovalve.clogging_exponent 0")
-    hidden = [item.name for item in identification.estimates if not item.shown]
-    if hidden:
-        out.append(f"the test does not show {', '.join(hidden)}")
-    return out
-
-
-def is_explained_by_discrepancy_alone(fit: Fit, calibration: Calibration | None = None) -> bool:
-    """Whether residuals beyond the limits are allowed for the discrepancy of the faults' laws.
-
-    Effects of the unit that are estimated with them may stand for that discrepancy.
-    """
-    most_outliers, most_rms = residual_limits(calibration)
-    return fit.outliers > most_outliers or not max(fit.spool_rms, fit.pressure_rms) <= most_rms
-
-
-def residual_limits(calibration: Calibration | None) -> tuple[float, float]:
-    """Outliers (share) and rms residual that an explained recording may have.
-
-    calibration: of the unit: what it could not explain is allowed, and what wear brings out of
-    effects that stand in for others.
-    """
-    if calibration is None:
-        return FIT.max_outlier_share, FIT.max_rms
-    further = has_further_effects(calibration)
-    if not (further or calibration.fit.left > 0.0):
-        return FIT.max_outlier_share, FIT.max_rms
-    fit = calibration.fit
-    outliers = (FIT.outlier_factor_further_effects if further else 1.0) * FIT.max_outlier_share
-    return (
-        min(outliers + WEAR_EXCESS_FACTOR * fit.outliers, FIT.max_outlier_share_poor_calibration),
-        min(
-            FIT.max_rms * WEAR_EXCESS_FACTOR * max(fit.spool_rms, fit.pressure_rms),
-            FIT.max_rms_poor_calibration,
-        ),
-    )
-
-
 def notes_on_recording(
     recording: Recording, test: StoredTest | None, actuator: Actuator
 ) -> tuple[str, ...]:
@@ -386,3 +322,277 @@ def objection_to_frame_order(recording: Recording) -> str:
         f"{LOSSES.max_out_of_order_share:.0%}): the frames have lost their order, and no counter "
         "tells it"
     )
+
+
+VELOCITY_SPAN_S = 0.05
+"""Over which a velocity is taken."""
+UNIT_ERROR_FACTORS: tuple[tuple[float, str], ...] = (
+    (-1.0, "its sign is reversed"),
+    (1e-3, "a unit 1000 times larger was sent"),
+    (1e3, "a unit 1000 times smaller was sent"),
+    (0.1, "a unit ten times larger was sent"),
+    (10.0, "a unit ten times smaller was sent"),
+    (25.4, "millimetres were sent as inches"),
+    (1.0 / 25.4, "inches were sent as millimetres"),
+    (14.5038, "psi were sent as bar"),
+    (1.0 / 14.5038, "bar were sent as psi"),
+)
+"""Measured over true value, and what makes that."""
+
+
+class ChannelRelation(msgspec.Struct, frozen=True):
+    """Slope of one channel over another, as measured, over what the actuator's data say."""
+
+    upper: str
+    """Channel whose error raises the ratio."""
+    lower: str
+    """Channel whose error lowers it."""
+    ratio: float
+    """1 where both units and signs are right."""
+
+
+def channel_relations(samples: Samples, actuator: Actuator) -> tuple[ChannelRelation, ...]:
+    """Compare the channels with each other, as far as the motion shows.
+
+    Spool over current is the torque motor's gain over the feedback wire's stiffness (PHY-4);
+    velocity of the jack over spool the flow gain over its area (PHY-6, PHY-7); the current that of
+    its command, or of the control law (PHY-2, PHY-3).
+    """
+    valve, jack = actuator.servovalve, actuator.jack
+    half = max(round(0.5 * VELOCITY_SPAN_S * 1e9 / samples.period_ns), 1)
+    velocity = _velocity(samples.position, half, samples.period_ns * 1e-9)
+    found = [
+        _relation("spool", "current", samples.spool, samples.current, valve.GM / valve.KSF),
+        _relation("position", "spool", velocity, _smooth(samples.spool, half), valve.GQ / jack.AJ),
+    ]
+    if samples.mode is CommandMode.CURRENT:
+        found.append(_relation("command", "current", samples.command, samples.current, 1.0))
+    elif np.isfinite(samples.command).any():
+        found.append(_relation("command", "position", samples.command, samples.position, 1.0))
+    return tuple(item for item in found if item is not None)
+
+
+def objections_to_units(samples: Samples, actuator: Actuator) -> tuple[str, ...]:
+    """Return a sentence for each channel with a wrong unit or sign; none without motion.
+
+    Of several explanations that with the fewest channels is chosen.
+    """
+    found = channel_relations(samples, actuator)
+    out = list(_explained(found))
+    pressure = _pressure(samples, actuator, {item.lower for item in found})
+    return (*out, *pressure)
+
+
+def objections_to_readings(samples: Samples, actuator: Actuator) -> list[str]:
+    """Return a sentence for each channel whose readings are too large for its unit or scale."""
+    out = []
+    for channel in CHANNELS:
+        values = np.abs(np.asarray(getattr(samples, channel.name)))
+        values = values[np.isfinite(values)]
+        largest, unit = largest_value(actuator, channel), channel.per_unit
+        top = float(np.quantile(values, 0.99)) if values.size else 0.0
+        if top > READINGS.max_reading_factor * largest:
+            out.append(
+                f"{channel.name} reads {top / unit:.3g} {channel.unit}, the actuator reaches"
+                f" {largest / unit:.3g} {channel.unit}: check unit and scale of its signal"
+            )
+    return out
+
+
+def _explained(found: tuple[ChannelRelation, ...]) -> tuple[str, ...]:
+    if all(abs(item.ratio - 1.0) <= READINGS.max_channel_ratio_error for item in found):
+        return ()
+    names = sorted({name for item in found for name in (item.upper, item.lower)})
+    for count in (1, 2):
+        best: tuple[float, tuple[str, ...]] | None = None
+        for wrong in itertools.combinations(names, count):
+            for choice in itertools.product(UNIT_ERROR_FACTORS, repeat=count):
+                factor = {name: value for name, (value, _) in zip(wrong, choice, strict=True)}
+                off = max(
+                    abs(item.ratio * factor.get(item.lower, 1.0) / factor.get(item.upper, 1.0) - 1)
+                    for item in found
+                )
+                words = tuple(
+                    f"{name}: {text}, or the mapping says so"
+                    for name, (_, text) in zip(wrong, choice, strict=True)
+                )
+                if off <= READINGS.max_channel_ratio_error and (best is None or off < best[0]):
+                    best = (off, words)
+        if best is not None:
+            return best[1]
+    return tuple(
+        f"{item.upper} moves {item.ratio:.3g} times as much with the {item.lower} as the actuator's"
+        " data say"
+        for item in found
+        if abs(item.ratio - 1.0) > READINGS.max_channel_ratio_error
+    )
+
+
+def _pressure(samples: Samples, actuator: Actuator, moved: set[str]) -> tuple[str, ...]:
+    """Hold the pressure that moves the jack against the friction that it may have."""
+    jack = actuator.jack
+    half = max(round(0.5 * VELOCITY_SPAN_S * 1e9 / samples.period_ns), 1)
+    velocity = _velocity(samples.position, half, samples.period_ns * 1e-9)
+    present = (
+        np.isfinite(velocity)
+        & np.isfinite(samples.pressure)
+        & (np.abs(velocity) > READINGS.min_jack_speed_m_per_s)
+    )
+    if present.sum() < READINGS.min_moving_ticks or "spool" not in moved:
+        return ()
+    force = jack.AJ * samples.pressure[present] - jack.FR
+    usual = float(np.median(np.abs(force)))
+    low, high = (
+        READINGS.friction_range_shares[0] * jack.FDJ0,
+        READINGS.friction_range_shares[1] * jack.FDJ1,
+    )
+    ahead = float(np.mean(np.sign(force) == np.sign(velocity[present])))
+    if ahead < 0.35:
+        return ("pressure: its sign is reversed against the jack's motion, or the mapping says so",)
+    if low <= usual <= high:
+        return ()
+    fits = [
+        text for value, text in UNIT_ERROR_FACTORS if value > 0 and low <= usual / value <= high
+    ]
+    why = " or ".join(fits) if fits else "another unit was sent"
+    return (
+        f"pressure: {usual:.3g} N move the jack, its friction is {jack.FDJ0:g} …"
+        f" {jack.FDJ1:g} N: {why}",
+    )
+
+
+def _relation(
+    upper: str, lower: str, y: Array, x: Array, expected: float
+) -> ChannelRelation | None:
+    present = np.isfinite(x) & np.isfinite(y)
+    if present.sum() < READINGS.min_moving_ticks:
+        return None
+    x, y = x[present] - x[present].mean(), y[present] - y[present].mean()
+    power, other = float(x @ x), float(y @ y)
+    if (
+        power == 0.0
+        or other == 0.0
+        or abs(float(x @ y)) < READINGS.min_channel_correlation * np.sqrt(power * other)
+    ):
+        return None
+    return ChannelRelation(upper, lower, float(x @ y) / power / expected)
+
+
+def _velocity(position: Array, half: int, period: float) -> Array:
+    """Mean velocity about each tick, m/s; NaN near the ends."""
+    out = np.full(len(position), np.nan)
+    if len(position) > 2 * half:
+        out[half:-half] = (position[2 * half :] - position[: -2 * half]) / (2 * half * period)
+    return out
+
+
+def _smooth(values: Array, half: int) -> Array:
+    """Mean over the same ticks, of what is there."""
+    present = np.isfinite(values)
+    kernel = np.ones(2 * half)
+    if len(values) < len(kernel):
+        return values
+    total = np.convolve(np.where(present, values, 0.0), kernel, "same")
+    count = np.convolve(present.astype(np.float64), kernel, "same")
+    return np.where(count > half, total / np.maximum(count, 1.0), np.nan)
+
+
+def objections_to_travel(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
+    """Name the sensor that shows another motion than the other channels; empty where all agree.
+
+    Only in closed loop, where the control law works on the position: a search would take long.
+    The jack's velocity is close to the spool's position times flow gain over jack area (PHY-6,
+    PHY-7), so that both travels correlate. The current, which the spool follows, shows which of the
+    two sensors is wrong.
+    """
+    travels = _travels(samples, actuator) if test.closed_loop else None
+    if travels is None:
+        return []
+    expected, measured = travels
+    least = RESPONSE.min_rms_travel_lsb * actuator_channels(actuator).position.grain
+    moved = float(expected.std()), float(measured.std())
+    if max(moved) < least:
+        return []
+    correlation = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
+    correlation /= max(moved[0] * moved[1], np.finfo(np.float64).tiny)
+    if correlation >= READINGS.min_travel_correlation:
+        return []
+    spool_follows = any(
+        item.upper == "spool" and item.lower == "current" and item.ratio > 0.0
+        for item in channel_relations(samples, actuator)
+    )
+    sensor = "position" if spool_follows else "spool"
+    if correlation < READINGS.max_reversed_travel_correlation:
+        return [f"the {sensor} sensor reads with the wrong sign"]
+    what = (
+        "the position does not follow the flow that the spool lets through: jack seized or at its "
+        "end, or position sensor dead, frozen, or another signal"
+        if spool_follows
+        else "the spool follows neither the current nor the jack's motion: spool sensor dead, "
+        "frozen, or another signal, or torque motor wired the wrong way round"
+    )
+    return [
+        f"{what} (correlation of the jack's travel with the spool's flow {correlation:.2f}, "
+        f"at least {READINGS.min_travel_correlation:g} needed)"
+    ]
+
+
+def _travels(samples: Samples, actuator: Actuator) -> tuple[Array, Array] | None:
+    """Travel over the span by the spool's flow and by the position sensor, m; None: too few."""
+    tick = samples.period_ns * 1e-9
+    span = round(TRAVEL_SPAN_S / tick)
+    seen = np.flatnonzero(np.isfinite(samples.spool))
+    if len(seen) < RESPONSE.min_travel_share * len(samples.spool) or len(samples.spool) <= span + 2:
+        return None
+    spool = np.interp(np.arange(len(samples.spool)), seen, samples.spool[seen])
+    gain = actuator.servovalve.GQ / actuator.jack.AJ
+    passed = np.concatenate([[0.0], np.cumsum(spool[:-1])]) * tick * gain
+    expected = passed[span:] - passed[:-span]
+    position = _without_spikes(samples.position)
+    measured = position[span:] - position[:-span]
+    present = np.isfinite(measured)
+    if present.mean() < RESPONSE.min_travel_share:
+        return None
+    return expected[present], measured[present]
+
+
+def _without_spikes(values: Array) -> Array:
+    """Median of each known value and its known neighbours."""
+    out, seen = values.copy(), np.flatnonzero(np.isfinite(values))
+    present = values[seen]
+    if len(seen) > 2:
+        out[seen[1:-1]] = median_of_three(present)
+    return out
+
+
+def objections_to_actuator(actuator: Actuator) -> list[str]:
+    """Why an actuator file cannot be right, with the data to look at; empty if it can."""
+    controller, valve, jack = actuator.controller, actuator.servovalve, actuator.jack
+    slew = valve.GQF * valve.XFM / valve.AS
+    speed = valve.GQ * valve.XSM / jack.AJ
+    force = valve.GPF * valve.XFM * valve.AS
+    ratios = (
+        ("spool travel at rated current over spool stop", "GM, IM, KSF, XSM",
+         valve.GM * controller.IM / valve.KSF / valve.XSM, 1.0),
+        ("flapper travel at rated current over flapper stop", "GM, IM, KF, XFM",
+         valve.GM * controller.IM / valve.KF / valve.XFM, 2.0),
+        ("spool travel in 1 s over spool stop", "GQF, XFM, AS, XSM", slew / valve.XSM, 500.0),
+        ("first stage's force over spool friction at the limit", "GPF, XFM, AS, FSS1",
+         force / valve.FSS1, 5.0),
+        ("spool acceleration by the first stage over that in 0.1 ms", "GPF, XFM, AS, MS, GQF",
+         force / valve.MS / (slew / 1e-4), 20.0),
+        ("pressure at the spool's stop over supply", "GP, XSM, PSR",
+         valve.GP * valve.XSM / valve.PSR, 40.0),
+        ("jack travel in 1 s over jack stop", "GQ, XSM, AJ, XJM", speed / jack.XJM, 3.0),
+        ("jack force over jack friction at the limit", "PSR, AJ, FDJ1",
+         valve.PSR * jack.AJ / jack.FDJ1, 10.0),
+        ("jack acceleration by the supply over that in 10 ms", "PSR, AJ, MJ, GQ, XSM",
+         valve.PSR * jack.AJ / jack.MJ / (speed / 1e-2), 15.0),
+    )  # fmt: skip
+    return [
+        f"actuator file: {what} is {ratio:.2g}, usual is {usual:g}: check {data}"
+        for what, data, ratio, usual in ratios
+        if not usual / READINGS.max_actuator_ratio_factor
+        <= ratio
+        <= usual * READINGS.max_actuator_ratio_factor
+    ]

@@ -1,8 +1,7 @@
-"""What a model leaves unexplained, by the block of the actuator, and what the spool's steps say."""
+"""What a model leaves unexplained, by the block of the actuator."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import msgspec
@@ -157,84 +156,3 @@ def words_of_pulls(pulls: Mapping[str, Mapping[str, float]]) -> str:
         for block, of_block in pulls.items()
     )
     return "not explained, in severities: " + "; ".join(parts)
-
-
-class StepRules(msgspec.Struct, frozen=True):
-    """Break-aways of the spool in slow ramps."""
-
-    noise_stds: float = 5.0
-    """Least travel in a tick of a break-away, in deviations of the noise of a difference."""
-    model_share: float = 0.5
-    """The same of the model's, which has no noise, over it, 1."""
-    min_count: int = 6
-    """Least number of steps of a spool that creeps, 1: it breaks away once at each of the turns of
-    the stored test's ramps, of which there are three."""
-    same_size: float = 0.5
-    """Least size of a step that is a break-away of the model's, over the median of these, 1."""
-    min_count_ratio: float = 2.0
-    """Least ratio of that number to the model's break-aways, 1."""
-
-
-STEPS = StepRules()
-
-
-def spool_steps(spool: Array, least: float) -> Array:
-    """Sizes of the steps in which a spool moves, m.
-
-    Parameters
-    ----------
-    spool : Array
-        Position of each tick in a slow ramp, m; NaN where missing.
-    least : float
-        Least travel in a tick of a step, m.
-
-    Returns
-    -------
-    Array
-        Travel of each, of adjacent ticks together.
-    """
-    known = np.flatnonzero(np.isfinite(spool))
-    change = np.diff(spool[known])
-    fast = np.concatenate([[0], np.abs(change) > least * np.diff(known), [0]]).astype(int)
-    edges = np.flatnonzero(np.diff(fast))
-    sizes = [abs(change[a:b].sum()) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return np.array(sizes)
-
-
-def creep_note(experiments: Sequence[Experiment], modelled: Sequence[Array]) -> str:
-    """Say that the spool creeps in steps where the model jumps once; empty where it does not.
-
-    Where the oil at the spool's ends yields the pressure falls as soon as the spool moves: it stops
-    after a micrometre, and friction passes for hysteresis. In closed loop the sensor's noise breaks
-    the spool away, so only open loop is looked at.
-
-    Parameters
-    ----------
-    experiments : Sequence[Experiment]
-        What was identified from.
-    modelled : Sequence[Array]
-        Spool of each as the model has it, m.
-
-    Returns
-    -------
-    str
-        A note with number and size of the steps.
-    """
-    steps, jumps = np.zeros(0), np.zeros(0)
-    for item, model in zip(experiments, modelled, strict=True):
-        least = STEPS.noise_stds * math.sqrt(2.0) * item.spool_noise
-        for begin, end in () if item.test.closed_loop else item.test.windows.FSS:
-            ticks = slice(round(begin / item.tick), round(end / item.tick))
-            steps = np.concatenate([steps, spool_steps(item.spool[ticks], least)])
-            jumps = np.concatenate([jumps, spool_steps(model[ticks], STEPS.model_share * least)])
-    if len(steps) < max(STEPS.min_count, STEPS.min_count_ratio * len(jumps)):
-        return ""
-    if len(jumps) and (steps > STEPS.same_size * np.median(jumps)).sum() >= len(jumps):
-        return ""  # it breaks away as the model does
-    expected = f"{len(jumps)} break-aways"
-    if len(jumps):
-        expected += f" of {np.median(jumps) * 1e6:.1f} µm"
-    return (
-        f"the spool creeps in {len(steps)} steps of {np.median(steps) * 1e6:.1f} µm, the model has"
-        f" {expected}: the oil at the spool's ends yields, and friction looks like hysteresis"
-    )

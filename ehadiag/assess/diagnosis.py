@@ -10,19 +10,19 @@ import msgspec
 import numpy as np
 
 from ehadiag.assess.acceptance import (
-    is_explained_by_discrepancy_alone,
     notes_on_recording,
     objection_to_current,
     objection_to_frame_order,
     objection_to_lost_positions,
+    objections_to_actuator,
     objections_to_conditions,
     objections_to_duplicates,
-    objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
+    objections_to_travel,
     objections_to_unit,
 )
-from ehadiag.assess.blocks import creep_note, unexplained_block
+from ehadiag.assess.blocks import unexplained_block
 from ehadiag.assess.lost_samples import (
     has_observable_severity,
     is_reconstructible,
@@ -38,10 +38,10 @@ from ehadiag.assess.other_causes import (
     notes_on_effects,
     with_limits,
 )
-from ehadiag.assess.plausibility import objections_to_actuator, objections_to_travel
 from ehadiag.assess.response_checks import (
     PositionFit,
     correct_delays,
+    creep_note,
     fit_position,
     identified_response,
     max_position_gain_error,
@@ -54,7 +54,14 @@ from ehadiag.assess.sampling_instants import (
     why_sampled_seldom,
     widen_by_instants,
 )
-from ehadiag.assess.verdict import Levels, Verdict, chance_above, judge
+from ehadiag.assess.verdict import (
+    Levels,
+    Verdict,
+    chance_above,
+    is_explained_by_discrepancy_alone,
+    judge,
+    objections_to_estimate,
+)
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FRICTION_NAME, with_unit
 from ehadiag.core.criteria import FIT, LOSSES, RECORDING, VERDICT
@@ -97,17 +104,14 @@ class Diagnosis(msgspec.Struct, frozen=True, eq=False):
     """Of each experiment the check of its position sensor; None where there are too few samples."""
     effects: tuple[Effect, ...]
     """Every effect of the unit and its installation that was estimated."""
+    other: tuple[Effect, ...]
+    """Those that have a limit of their own, in the order of the actuator file."""
     culprit: Culprit | None
     """What may keep the model from explaining the recordings; None where it explains them."""
     notes: tuple[str, ...]
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
     """Time from samples to verdict, s."""
-
-    @property
-    def other(self) -> tuple[Effect, ...]:
-        """Effects that have a limit of their own, in the order of the actuator file."""
-        return with_limits(self.effects, self.actuator)
 
 
 IdentifiedRecordings = tuple[list[Experiment], Identification, tuple[str, ...], tuple[str, ...]]
@@ -145,9 +149,8 @@ class DiagnosisSession:
         self._tests = tuple(tests)
         self._default = default
         self._levels = levels or Levels()
-        self._session = IdentificationSession(
-            solver, seed, nuisances, unit_prior(actuator), earlier
-        )
+        self._prior = unit_prior(actuator)
+        self._session = IdentificationSession(solver, seed, nuisances, self._prior, earlier)
 
     @property
     def reused(self) -> int:
@@ -210,9 +213,10 @@ class DiagnosisSession:
         orders = tuple(dict.fromkeys(filter(None, map(objection_to_frame_order, recordings))))
         loss_reasons = (*map(objection_to_lost_positions, experiments), *orders)
         hidden = tuple(dict.fromkeys(reason for reason in reasons if reason in loss_reasons))
-        closed = any(item.test.closed_loop for item in experiments)
         lost = bool(hidden) and set(reasons) <= set(hidden) and has_observable_severity(experiments)
         identification: Identification | None = None
+        effects: tuple[Effect, ...] = ()
+        limited: tuple[Effect, ...] = ()
         positions: tuple[PositionFit | None, ...] = ()
         culprit: Culprit | None = None
         late: tuple[str, ...] = ()
@@ -222,7 +226,7 @@ class DiagnosisSession:
         )
         if lost and reconstructed is None:
             found = self._session.finish(experiments, progress)
-            identification, words = restrict_to_observable(found, closed=closed)
+            identification, words = restrict_to_observable(found, experiments)
             why = tuple(f"{reason}: {words}" for reason in hidden)
         if reconstructed is not None or not reasons:
             experiments, identification, late, why = reconstructed or self._estimated(
@@ -232,7 +236,7 @@ class DiagnosisSession:
             slow = identification.slip_speed
             positions = tuple(map(partial(fit_position, slip_speed=slow), experiments, modelled))
             if why and orders:
-                identification, words = restrict_to_observable(identification, closed=closed)
+                identification, words = restrict_to_observable(identification, experiments)
                 why = tuple(f"{reason}: {words}" for reason in orders)
             elif why:
                 culprit = find_culprit(experiments, identification, recordings[0].environment)
@@ -246,7 +250,8 @@ class DiagnosisSession:
                 if why and is_explained_by_discrepancy_alone(identification.fit):
                     block = unexplained_block(experiments, modelled)
                     why = (*why, f"not explained to the noise either: the {block}")
-            limited = with_limits(effects_of(identification, self._actuator), self._actuator)
+            effects = effects_of(identification, self._prior, self._actuator)
+            limited = with_limits(effects, self._actuator)
             unlike = creep_note(experiments, [item.spool for item in modelled])
             if self._actuator.calibration is not None:
                 unlike = unlike or note_on_stand_ins(limited, identification.fit)
@@ -255,7 +260,9 @@ class DiagnosisSession:
                 why = why or _objections_to_friction(identification, self._levels, unlike)
             if not why:
                 verdict, why = count_other_faults(limited, *judge(identification, self._levels))
-        effects = effects_of(identification, self._actuator)
+        elif identification is not None:
+            effects = effects_of(identification, self._prior, self._actuator)
+            limited = with_limits(effects, self._actuator)
         return Diagnosis(
             recordings=tuple(recordings),
             tests=matched,
@@ -266,6 +273,7 @@ class DiagnosisSession:
             experiments=tuple(experiments) if identification else (),
             positions=positions,
             effects=effects,
+            other=limited,
             culprit=culprit,
             notes=(
                 *_notes(recordings, matched, self._actuator),
@@ -273,7 +281,7 @@ class DiagnosisSession:
                 *late,
                 *_notes_on_discrepancy(identification, self._actuator, verdict),
                 *_notes_on_unchecked_positions(positions),
-                *notes_on_effects(with_limits(effects, self._actuator)),
+                *notes_on_effects(limited),
             ),
             elapsed=time.perf_counter() - begin,
         )
@@ -365,9 +373,7 @@ def examined_recordings(
                 recording
             ):
                 objections = [objection_to_frame_order(recording)]
-            if test.closed_loop and not objections:
-                # The control law works on the position: a search would take long.
-                objections = objections_to_travel(recording.samples, actuator)
+            objections = objections or objections_to_travel(recording.samples, test, actuator)
             experiments.append(experiment)
         reasons += objections
     if len({recording.serial for recording in recordings} - {None}) > 1:
@@ -437,6 +443,7 @@ def not_tested(
         experiments=(),
         positions=(),
         effects=(),
+        other=(),
         culprit=None,
         notes=_notes(recordings, tests, actuator),
         elapsed=elapsed,

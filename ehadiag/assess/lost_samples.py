@@ -40,12 +40,14 @@ def has_observable_severity(experiments: Sequence[Experiment]) -> bool:
     return all(item.trace.guessed <= LOSSES.max_guessed_share_observable for item in experiments)
 
 
-def restrict_to_observable(found: Identification, *, closed: bool) -> tuple[Identification, str]:
+def restrict_to_observable(
+    found: Identification, experiments: Sequence[Experiment]
+) -> tuple[Identification, str]:
     """Replace severities that lost samples hide by uniform densities, and widen the others.
 
-    closed: whether a test in closed loop is among the recordings. Also returns in words what can be
-    observed and what cannot.
+    experiments: that it was found from. Also returns in words what can be observed and what cannot.
     """
+    closed = any(item.test.closed_loop for item in experiments)
     hidden = [name for name, law in FAULT_LAWS.items() if closed and law.needs_each_tick]
     estimates = tuple(_widened_estimate(item, hidden) for item in found.estimates)
     scale = np.array(

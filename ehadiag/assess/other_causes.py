@@ -17,13 +17,13 @@ from statistics import NormalDist
 import msgspec
 import numpy as np
 
-from ehadiag.assess.acceptance import is_explained_by_discrepancy_alone
-from ehadiag.assess.verdict import Verdict
+from ehadiag.assess.verdict import Verdict, is_explained_by_discrepancy_alone
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import finite
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95, VERDICT
-from ehadiag.estimate import Culprit, Effect, Suspect, finite
+from ehadiag.estimate import Culprit, Effect, Suspect
 from ehadiag.identify.experiment import (
     Experiment,
     lay_out_spans,
@@ -32,7 +32,7 @@ from ehadiag.identify.experiment import (
     unknowns_of,
 )
 from ehadiag.identify.identification_result import Fit, Identification
-from ehadiag.identify.prior import UnitPrior, unit_prior, usual_prior
+from ehadiag.identify.prior import UnitPrior, usual_prior
 from ehadiag.identify.ring import find_ring
 from ehadiag.model.parameter import Parameter, ParameterKind, scaled_to_channels
 from ehadiag.model.plant import REFERENCE_TEMPERATURE, relative_viscosity
@@ -44,17 +44,17 @@ PLAYS = ("hysteresis", "backlash")
 """Effects that a spool's friction may pass for."""
 
 
-def effects_of(identification: Identification | None, actuator: Actuator) -> tuple[Effect, ...]:
+def effects_of(
+    identification: Identification, prior: UnitPrior, actuator: Actuator
+) -> tuple[Effect, ...]:
     """Return every effect that was estimated, in the order of the identification.
 
-    identification: None where there is none; actuator: data of the unit, with its limits. Returns
-    values, limits, and what was known of them beforehand. None is beyond its limit where more is
-    left than noise: a calibrated effect stands for a wrong law of wear then, by up to 14 deviations
-    of a torque motor's gain.
+    prior: what was known of the unit beforehand; actuator: its data, with its limits. Returns
+    values, limits, and what was known of them. None is beyond its limit where more is left than
+    noise: a calibrated effect stands for a wrong law of wear then, by up to 14 deviations of a
+    torque motor's gain.
     """
-    if identification is None:
-        return ()
-    prior_of_unit, channels = unit_prior(actuator), actuator_channels(actuator)
+    channels = actuator_channels(actuator)
     doubtful = is_explained_by_discrepancy_alone(identification.fit)
     out = []
     for name, found in identification.nuisances.items():
@@ -64,7 +64,7 @@ def effects_of(identification: Identification | None, actuator: Actuator) -> tup
         chance = None
         if limit is not None and known and not doubtful:
             chance = chance_beyond(found.value, found.std, limit)
-        prior, source = _prior(item, prior_of_unit)
+        std, source = _prior(item, prior)
         out.append(
             Effect(
                 name=name,
@@ -80,7 +80,7 @@ def effects_of(identification: Identification | None, actuator: Actuator) -> tup
                 beyond=None if chance is None else chance >= VERDICT.min_chance_beyond_limit,
                 chance=chance,
                 at_bound=found.at_bound,
-                prior_std=prior,
+                prior_std=std,
                 source=source,
                 meaning=item.short,
             )

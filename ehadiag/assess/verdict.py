@@ -1,4 +1,4 @@
-"""Verdicts, their levels and exit codes."""
+"""Verdicts, their levels and exit codes, and whether estimates can carry one."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from ehadiag.core.actuator import WEAR_EXCESS_FACTOR
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import VERDICT
+from ehadiag.core.criteria import FIT, VERDICT
 from firmware_iface.errors import ConfigurationError
 
 if TYPE_CHECKING:  # the command line needs levels and codes long before it loads the compiler
-    from ehadiag.identify.identification_result import Estimate, Identification
+    from ehadiag.core.actuator import Calibration
+    from ehadiag.identify.identification_result import Estimate, Fit, Identification
 
 
 class Verdict(IntEnum):
@@ -168,3 +170,72 @@ def chance_above(item: Estimate, level: float) -> float:
     density = NormalDist(item.value, item.std)
     low, at, high = (density.cdf(x) for x in (0.0, level, 1.0))
     return (high - at) / (high - low) if high > low else float(item.value >= level)
+
+
+def objections_to_estimate(
+    identification: Identification, calibration: Calibration | None = None
+) -> list[str]:
+    """Why estimates cannot carry a verdict; empty if they can.
+
+    calibration: of the unit: what it could not explain is no reason.
+    """
+    fit = identification.fit
+    out = []
+    rms = fit.unexplained_rms
+    most_outliers, most_rms = residual_limits(calibration)
+    if fit.unexplained_outliers > most_outliers or not rms <= most_rms:
+        out.append(
+            f"the model does not explain the recording: {fit.unexplained_outliers:.1%} of the "
+            f"residuals beyond three times the noise (limit {most_outliers:.1%}), rms residual "
+            f"{rms:.2f} (limit {most_rms:.3g}): other actuator data, or an effect that the three "
+            "faults leave out"
+        )
+    if identification.ambiguous and not out:
+        out.append(
+            "searches with all effects of the unit leave more than noise in closed loop, where"
+            " friction and hysteresis look alike: record the open-loop test, too"
+        )
+    if identification.better_exponent is not None:
+        out.append(
+            "the recording contradicts servovalve.clogging_exponent: with"
+            f" {identification.better_exponent:g} far more of it is explained"
+        )
+    if out and identification.exponent_doubted:
+        out.append("the recording does not bear out servovalve.clogging_exponent 0")
+    hidden = [item.name for item in identification.estimates if not item.shown]
+    if hidden:
+        out.append(f"the test does not show {', '.join(hidden)}")
+    return out
+
+
+def is_explained_by_discrepancy_alone(fit: Fit, calibration: Calibration | None = None) -> bool:
+    """Whether residuals beyond the limits are allowed for the discrepancy of the faults' laws.
+
+    Effects of the unit that are estimated with them may stand for that discrepancy.
+    """
+    most_outliers, most_rms = residual_limits(calibration)
+    return fit.outliers > most_outliers or not max(fit.spool_rms, fit.pressure_rms) <= most_rms
+
+
+def residual_limits(calibration: Calibration | None) -> tuple[float, float]:
+    """Outliers (share) and rms residual that an explained recording may have.
+
+    calibration: of the unit: what it could not explain is allowed, and what wear brings out of
+    effects that stand in for others.
+    """
+    if calibration is None:
+        return FIT.max_outlier_share, FIT.max_rms
+    from ehadiag.identify.prior import has_further_effects  # noqa: PLC0415 - loads kernels
+
+    further = has_further_effects(calibration)
+    if not (further or calibration.fit.left > 0.0):
+        return FIT.max_outlier_share, FIT.max_rms
+    fit = calibration.fit
+    outliers = (FIT.outlier_factor_further_effects if further else 1.0) * FIT.max_outlier_share
+    return (
+        min(outliers + WEAR_EXCESS_FACTOR * fit.outliers, FIT.max_outlier_share_poor_calibration),
+        min(
+            FIT.max_rms * WEAR_EXCESS_FACTOR * max(fit.spool_rms, fit.pressure_rms),
+            FIT.max_rms_poor_calibration,
+        ),
+    )

@@ -19,9 +19,9 @@ from typing import Any, BinaryIO
 import msgspec
 
 from ehadiag.core.conventions import MAX_RESULT_BYTES, __version__, fingerprint, start_text
-from ehadiag.records import configuration_of, package
+from ehadiag.records import configuration_of, log_of, package
 from ehadiag.result import Configuration, ListedTest, Log, Result
-from ehadiag.setup import PathLike, Progress, Setup, log_of
+from ehadiag.setup import PathLike, Progress, Setup
 from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.files import RESULT_MODE, Folder, create_file, private_folder, reopen_file
 from firmware_iface.recording import Recording

@@ -1,12 +1,10 @@
-"""Files of a whole call's results: CSV and Parquet tables, JUnit XML, and a summary of all."""
+"""Files of a whole call's results: CSV and Parquet tables, JUnit XML, the summary."""
 
 from __future__ import annotations
 
 import io
 import json
 import platform
-import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
@@ -18,7 +16,6 @@ import msgspec
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.estimate import Effect, Severity
-from ehadiag.records import package
 from ehadiag.result import Result
 from firmware_iface.errors import (
     ConfigurationError,
@@ -302,125 +299,7 @@ def _csv_cell(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA_PREFIXES) else value
 
 
-SUMMARY_SCHEMA = "ehadiag.summary/1"
-MAX_FAILURES_NAMED = 100
-"""Failures that are kept with their reasons."""
-MAX_WORST_UNITS = 10
-
-
-class BatchSummary:
-    """Takes each result, and keeps what is told at the end; of a size that does not grow."""
-
-    def __init__(self, inputs: int) -> None:
-        self._inputs = inputs
-        self._begin = time.perf_counter()
-        self._verdicts: Counter[str] = Counter()
-        self._failures: list[dict[str, str]] = []
-        self._failed = 0
-        self._not_tested: list[dict[str, Any]] = []
-        self._worst: dict[object, dict[str, Any]] = {}
-        self.reused = 0
-        """Results that an earlier call had found."""
-        self.left = 0
-        """Recordings that were not come to."""
-        self.codes: set[int] = set()
-        """Exit codes that came."""
-
-    def take(self, result: Result) -> None:
-        """Count a result."""
-        if result.error is not None:
-            self._failed += 1
-            if len(self._failures) < MAX_FAILURES_NAMED:
-                error = {"source": result.source, "error": result.error.text}
-                self._failures.append(error)
-            return
-        self._verdicts[result.verdict.name] += 1
-        if result.verdict is Verdict.NOT_TESTED:
-            if len(self._not_tested) < MAX_FAILURES_NAMED:
-                reasons = {"source": result.source, "reasons": list(result.reasons)}
-                self._not_tested.append(reasons)
-            return
-        self._rank(result)
-
-    def _rank(self, result: Result) -> None:
-        """Keep it if it is among the worst units; of one unit the worst result."""
-        found = [item for item in result.severities.values() if item.estimate is not None]
-        if not found:
-            return
-        worst = max(found, key=lambda item: item.value)
-        unit = result.source if result.serial is None else ("serial", result.serial)
-        before = self._worst.get(unit)
-        if before is None or before["estimate"] < worst.value:
-            self._worst[unit] = {
-                "serial": result.serial,
-                "source": result.source,
-                "verdict": result.verdict.name,
-                "fault": worst.name,
-                "estimate": worst.estimate,
-                "interval95": worst.interval95,
-            }
-        if len(self._worst) > MAX_WORST_UNITS:
-            del self._worst[min(self._worst, key=lambda key: self._worst[key]["estimate"])]
-
-    def tree(self, exit_code: int, workers: int) -> dict[str, Any]:
-        """Return the object `ehadiag.summary/1`."""
-        elapsed = time.perf_counter() - self._begin
-        done = sum(self._verdicts.values()) + self._failed - self.reused
-        names = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
-        worst = sorted(self._worst.values(), key=lambda item: -item["estimate"])
-        return {
-            "schema": SUMMARY_SCHEMA,
-            "inputs": self._inputs,
-            "verdicts": {name: self._verdicts[name] for name in names},
-            "failed": self._failed,
-            "reused": self.reused,
-            "not_diagnosed": self.left,
-            "worst": worst,
-            "failures": self._failures,
-            "not_tested": self._not_tested,
-            "workers": workers,
-            "elapsed_s": round(elapsed, 3),
-            "rate_per_s": round(done / elapsed, 3) if elapsed > 0 else None,
-            "exit_code": exit_code,
-            "package": msgspec.to_builtins(package()),
-        }
-
-
 def write_summary(tree: dict[str, Any], name: str) -> None:
     """Write the object to a file; InputOutputError where that fails."""
     with atomic_file(name, "summary") as file:
         file.write(json.dumps(tree, indent=2, allow_nan=False).encode() + b"\n")
-
-
-def summary_lines(tree: dict[str, Any]) -> list[str]:
-    """Return the summary for people."""
-    verdicts = ", ".join(
-        f"{count} {name.replace('_', ' ')}" for name, count in tree["verdicts"].items() if count
-    )
-    failed = f", {tree['failed']} not readable" if tree["failed"] else ""
-    reused = f", {tree['reused']} of them from an earlier call" if tree["reused"] else ""
-    lines = [
-        f"{tree['inputs']} recordings in {tree['elapsed_s']:.1f} s ({tree['rate_per_s']:.1f}/s): "
-        f"{verdicts or 'none diagnosed'}{failed}{reused}"
-    ]
-    if tree["not_diagnosed"]:
-        lines.append(f"not diagnosed: {tree['not_diagnosed']}")
-    counts = tree["verdicts"]
-    worst = [item for item in tree["worst"] if item["verdict"] in ("FAULT", "DEGRADED")]
-    for item in worst:
-        unit = "" if item["serial"] is None else f"serial {item['serial']}: "
-        lines.append(
-            f"{item['verdict']} {unit}{item['fault']} {item['estimate']:.3f}  {item['source']}"
-        )
-    lines += _more(counts["FAULT"] + counts["DEGRADED"] - len(worst), "FAULT or DEGRADED")
-    lines += [f"NOT TESTED {item['source']}: {'; '.join(item['reasons'])}"
-              for item in tree["not_tested"][:MAX_WORST_UNITS]]  # fmt: skip
-    lines += _more(counts["NOT_TESTED"] - MAX_WORST_UNITS, "NOT TESTED")
-    lines += [f"not readable: {item['error']}" for item in tree["failures"][:MAX_WORST_UNITS]]
-    lines += _more(tree["failed"] - MAX_WORST_UNITS, "not readable")
-    return [printable(line) for line in lines]
-
-
-def _more(count: int, what: str) -> list[str]:
-    """Line on those that are not listed."""
-    return [f"and {count} more {what}"] if count > 0 else []

@@ -1,120 +1,17 @@
-"""The recordings that a call names, and the processes or Dask cluster that work on them."""
+"""The processes or the Dask cluster that work on the recordings of a call."""
 
 from __future__ import annotations
 
-import glob
-import os
-import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import msgspec
-
-from ehadiag.batch.result_files import is_result_table
-from ehadiag.core.conventions import SIGNAL_FILE_SUFFIXES
 from ehadiag.core.interruption import children_with_safe_path
-from firmware_iface.errors import ConfigurationError, InputOutputError, install_command, reason_of
+from firmware_iface.errors import ConfigurationError, InputOutputError, install_command
 
 if TYPE_CHECKING:
     from distributed import Client
-
-STANDARD_INPUT_NAME = "-"
-MAX_LIST_BYTES = 64 << 20
-"""A list of a hundred thousand long names is a tenth of it."""
-
-
-class LogInput(msgspec.Struct, frozen=True):
-    """One recording to diagnose."""
-
-    name: str
-    """As it was named, or as it was found."""
-    why: str = ""
-    """Why there is none; empty for a recording."""
-
-
-def expand_logs(names: Iterable[str], report: Callable[[str], None]) -> list[LogInput]:
-    """Return the recordings that arguments stand for, in their order and as often as named.
-
-    A folder stands for all recordings in it and below, in the order of their names, but not for
-    hidden ones, what lies in hidden folders or behind links, and tables and signals of results; a
-    pattern (`*`, `?`, `[…]`, `**`), where there is no file of that name, for what it matches; `-`
-    for the names on standard input, one a line, or ended by null characters.
-
-    names: arguments of the command; report: takes a sentence on what of a folder is left out. A
-    name that stands for no recording is in the list too, with the reason. ConfigurationError: the
-    list on standard input is longer than any list of names.
-    """
-    return [
-        item
-        for name in names
-        for path in (_names_on_standard_input() if name == STANDARD_INPUT_NAME else [name])
-        for item in _expand_path(path, report)
-    ]
-
-
-def _expand_path(name: str, report: Callable[[str], None]) -> Iterator[LogInput]:
-    if os.path.isdir(name):
-        yield from _expand_folder(name, report)
-    elif glob.has_magic(name) and not os.path.lexists(name):
-        matches = sorted(glob.glob(name, recursive=True))
-        for match in matches:
-            if os.path.isdir(match):
-                yield from _expand_folder(match, report)
-            else:
-                yield LogInput(match)
-        if not matches:
-            yield LogInput(name, f"pattern {name}: matches no file")
-    else:
-        yield LogInput(name)
-
-
-def _expand_folder(folder: str, report: Callable[[str], None]) -> Iterator[LogInput]:
-    from firmware_iface.logs.log_files import kind_of, known_suffixes  # noqa: PLC0415
-
-    known = known_suffixes()
-    links: list[str] = []
-    inside = []
-    closed: list[OSError] = []
-    for place, folders, names in os.walk(folder, onerror=closed.append):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        links += [path for name in folders if os.path.islink(path := os.path.join(place, name))]
-        inside += [
-            os.path.join(place, name)
-            for name in names
-            if not name.startswith(".") and kind_of(Path(name)) in known
-        ]
-    ours = [name for name in inside if is_result_table(Path(name))]
-    signals = [name for name in inside if name.endswith(SIGNAL_FILE_SUFFIXES)]
-    for left_out, why in (
-        (links, "a link to a folder is not followed, name the folder to read it"),
-        (ours, "a table of results is no recording"),
-        (signals, "signals of a result are no recording"),
-    ):
-        if left_out:
-            more = f" and {len(left_out) - 1} more" if len(left_out) > 1 else ""
-            report(f"folder {folder}: {why}: {min(left_out)}{more}")
-    recordings = sorted(set(inside).difference(ours, signals))
-    for error in closed:
-        yield LogInput(error.filename, f"folder {error.filename}: {reason_of(error)}")
-    if not recordings and not closed:
-        yield LogInput(folder, f"folder {folder}: no recording in it ({', '.join(sorted(known))})")
-    yield from map(LogInput, recordings)
-
-
-def _names_on_standard_input() -> list[str]:
-    """Names on standard input."""
-    stream = getattr(sys.stdin, "buffer", None)
-    if stream is None:  # a text put in its place
-        content = sys.stdin.read(MAX_LIST_BYTES + 1)
-    else:
-        content = os.fsdecode(stream.read(MAX_LIST_BYTES + 1))
-    if len(content) > MAX_LIST_BYTES:
-        raise ConfigurationError(f"standard input: more than {MAX_LIST_BYTES} bytes of names")
-    lines = content.split("\0") if "\0" in content else content.splitlines()
-    return [line for line in lines if line.strip()]
 
 
 Given = TypeVar("Given")

@@ -19,18 +19,17 @@ from ehadiag.batch.result_files import (
     JUNIT_NOT_TESTED,
     RESULT_SUFFIXES,
     TABLE_FORMATS,
-    BatchSummary,
     ResultSink,
     junit_report,
     result_file_suffix,
-    summary_lines,
     write_summary,
 )
-from ehadiag.batch.workers import LogInput, Workers, worker_count
+from ehadiag.batch.workers import Workers, worker_count
 from ehadiag.cli.options import positive_count
 from ehadiag.cli.result_output import ResultWriter
 from ehadiag.core.interruption import (
     INTERRUPTED_EXIT_CODE,
+    defer_signals,
     ignore_interrupt_in_worker,
     interrupt_on_signals,
 )
@@ -39,13 +38,20 @@ from ehadiag.result import Log, Result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     INPUT_OUTPUT_EXIT_CODE,
+    BatchSummary,
     counting_bar,
+    exit_code_of_inputs,
     print_compiling_notice,
     print_status,
     progress_bar,
+    report_failure,
+    summary_lines,
     worst_exit_code,
 )
-from firmware_iface.errors import EhadiagError, InputOutputError
+from firmware_iface.errors import (
+    EhadiagError,
+    InputOutputError,
+)
 from firmware_iface.recording import Recording
 
 MIN_RECORDINGS_FOR_SUMMARY = 5
@@ -118,8 +124,7 @@ def diagnose_and_deliver(
         found = setup.not_tested(
             recordings, "stopped by the user", files=files, logs=logs, read_s=read_s
         )
-    draw = partial(diagnosis_png, found) if found.can_be_drawn else None
-    return found, results.deliver(found, name or setup.name(files[0], found), draw)
+    return found, results.deliver(found, name or setup.name(files[0], found))
 
 
 class Finding(NamedTuple):
@@ -167,7 +172,7 @@ class _BatchTask(msgspec.Struct, frozen=True):
 
 
 class BatchRun:
-    """One call that diagnoses each recording by itself.
+    """One call that diagnoses each recording by itself, or all as files of one, or jointly.
 
     setups: what is wanted, of each actuator on the bus; results: where each result goes.
     """
@@ -182,6 +187,7 @@ class BatchRun:
         self._arguments = arguments
         self._setups = tuple(setups)
         self._results = results
+        self._logs = inputs
         self._inputs = [
             _BatchTask(number, item) for item in inputs for number in range(len(setups))
         ]
@@ -198,6 +204,12 @@ class BatchRun:
 
         A file that cannot be written keeps no verdict from being printed.
         """
+        print_compiling_notice()
+        if self._arguments.merge:
+            merged = {self._merged(setup) for setup in self._setups}
+            return worst_exit_code(merged) if len(merged) > 1 else merged.pop()
+        if self._arguments.joint:
+            return self._joint(self._setups[0])
         workers = self._workers()
         try:
             with ExitStack() as stack:
@@ -214,6 +226,35 @@ class BatchRun:
             self._summary.codes.add(INPUT_OUTPUT_EXIT_CODE)
             self._summary.left = len(self._inputs) - self._came
         return self._conclude(workers)
+
+    def _joint(self, setup: Setup) -> int:
+        """Make one estimate from all logs."""
+        together: list[Recording] = []
+        logs: list[Log | None] = []
+        read_s = 0.0
+        codes: list[int] = []
+        for item in self._logs:
+            with report_failure(codes, EhadiagError), progress_bar() as progress:
+                reading = setup.read(readable_name(item), progress=progress)
+                for recording, log in reading.each():
+                    together.append(recording)
+                    logs.append(log)
+                read_s += reading.seconds
+        if any(codes):
+            print_status("no joint estimate: not all of the logs could be read")
+            return exit_code_of_inputs(codes)
+        files = [item.name for item in self._logs]
+        return diagnose_and_deliver(setup, self._results, together, files, logs, read_s, "joint")[1]
+
+    def _merged(self, setup: Setup) -> int:
+        """Diagnose one recording that is split over several files."""
+        with progress_bar() as progress:
+            reading = setup.read(*map(readable_name, self._logs), progress=progress)
+        files, read_s = reading.files, reading.seconds
+        return worst_exit_code(
+            diagnose_and_deliver(setup, self._results, [recording], files, [log], read_s)[1]
+            for recording, log in reading.each()
+        )
 
     def _workers(self) -> int:
         """Return how many processes; 1: only this one."""
@@ -279,7 +320,6 @@ class BatchRun:
     def _among(self, jobs: int) -> int:
         """Diagnose in workers; return how many there were."""
         interrupt_on_signals()
-        print_compiling_notice()  # before several workers would
         new = [task for task in self._inputs if not (task.item.why or self._known(task))]
         with (
             Workers(jobs, self._arguments.cluster) as workers,
@@ -319,9 +359,8 @@ class BatchRun:
             if result.error is not None:
                 self._fail(result)
                 return
-            draw = None if picture is None else lambda content=picture: content
             name = setup.name(task.item.name, result)
-            code = self._results.deliver(result, name, draw, alone=False)
+            code = self._results.deliver(result, name, picture, alone=False)
             self._take(result, unit=task.unit)
             self._summary.codes.add(code)
         self._came += 1
@@ -382,7 +421,8 @@ class BatchRun:
         self._interrupted = True
 
     def _conclude(self, workers: int) -> int:
-        """Tell of all; return the exit code."""
+        """Tell of all; return the exit code, which no signal changes any more."""
+        defer_signals()
         codes = self._summary.codes
         code = (
             next(iter(codes), 0)
@@ -409,3 +449,19 @@ def _abandoned_task(setups: Sequence[Setup], task: _BatchTask) -> tuple[Finding,
     name = task.item.name
     text = f"log {name}: the process that diagnosed it ended, twice; not enough memory?"
     return (Finding(setups[task.unit].failure(name, text, INPUT_OUTPUT_EXIT_CODE)),)
+
+
+class LogInput(msgspec.Struct, frozen=True):
+    """One recording to diagnose."""
+
+    name: str
+    """As it was named, or as it was found."""
+    why: str = ""
+    """Why there is none; empty for a recording."""
+
+
+def readable_name(item: LogInput) -> str:
+    """Name of an input; InputOutputError: it was found unreadable when the names were expanded."""
+    if item.why:
+        raise InputOutputError(item.why)
+    return item.name

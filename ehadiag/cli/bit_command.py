@@ -10,10 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import option_values, options
+from ehadiag.cli import options
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import add_history_options
-from ehadiag.cli.option_values import add_actuators_options, arguments_of_actuators
+from ehadiag.cli.options import add_actuators_options, add_history_options, arguments_of_actuators
 from ehadiag.cli.result_output import (
     OutputFile,
     ResultWriter,
@@ -22,7 +21,6 @@ from ehadiag.cli.result_output import (
 )
 from ehadiag.cli.simulator_options import add_simulator_options, simulator_settings
 from ehadiag.core.interruption import stop_on_signals
-from ehadiag.report.rendering import diagnosis_png
 from ehadiag.request import TEST
 from ehadiag.session.bit_run import (
     BitSettings,
@@ -109,8 +107,8 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
     options.add_json_option(parser)
     add_history_options(parser)
     options.add_result_options(parser)
-    option_values.add_bus_options(parser)
-    option_values.add_protocol_option(parser)
+    options.add_bus_options(parser)
+    options.add_protocol_option(parser)
     add_simulator_options(parser)
     show_help(
         parser,
@@ -143,7 +141,9 @@ def run_bit(
         single = len(setups) == 1  # no screen shows several
         show = (snapshots or screen.take) if single else None
         shown = bool(snapshots or arguments.snapshots or can_show_screen(plain=arguments.plain))
-        monitor = _bit_monitor(setups[0], test, results.history, shown=shown) if single else None
+        monitor = (
+            _bit_monitor(setups[0], test, results.history.place, shown=shown) if single else None
+        )
         simulation = _Simulation()
         runs = [
             stack.enter_context(
@@ -166,15 +166,14 @@ def run_bit(
 
                 names = ", ".join(item.label for item in setups)
                 print_status(f"listening for test {test.name!r} of {names}, recording to {path}")
-                with option_values.open_transport(arguments, transmit=False) as bus:
+                with options.open_transport(arguments, transmit=False) as bus:
                     recorder = Recorder(path, channel=setups[0].bus_map.channel)
                     listen_for_tests(runs, bus, recorder, str(path), stop)
         found = [item.diagnose(stop) for item in runs]
     codes = set()
     for result, setup in zip(found, setups, strict=True):
-        draw = partial(diagnosis_png, result) if result.can_be_drawn else None
         name = f"{path.stem}-{setup.label}" if setup.label else path.stem
-        codes.add(results.deliver(result, name, draw))
+        codes.add(results.deliver(result, name))
     return worst_exit_code(codes) if len(codes) > 1 else codes.pop()
 
 
@@ -228,7 +227,7 @@ def _settings(arguments: argparse.Namespace, setup: Setup, simulation: _Simulati
         limits=ChannelLimits(**limits),
         onboard_wait_s=arguments.onboard_wait,
         protocol=arguments.protocol,
-        bitrate=option_values.bitrate_from_options(arguments, setup.bus_map),
+        bitrate=options.bitrate_from_options(arguments, setup.bus_map),
         own_fault=simulation.own_fault,
     )
 
@@ -247,7 +246,7 @@ def _connection(
     with ExitStack() as stack:
         if not arguments.simulate:
             bus = stack.enter_context(
-                option_values.open_transport(arguments, transmit=not arguments.listen)
+                options.open_transport(arguments, transmit=not arguments.listen)
             )
         else:
             from ehadiag_sim.emulator import (  # noqa: PLC0415 - loads kernels
@@ -262,10 +261,10 @@ def _connection(
             if arguments.fast:
                 bus = stack.enter_context(EmulatorTransport(core))
             else:
-                if not option_values.has_bus(arguments):
+                if not options.has_bus(arguments):
                     arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
                 computer, bus = (
-                    stack.enter_context(option_values.open_transport(arguments, transmit=True))
+                    stack.enter_context(options.open_transport(arguments, transmit=True))
                     for _ in range(2)
                 )
                 simulation.pace = stack.enter_context(emulator_in_thread(core, computer))
@@ -303,7 +302,7 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         raise ConfigurationError("--simulate and --listen exclude each other")
     if arguments.fast and not arguments.simulate:
         raise ConfigurationError("--fast: only the simulated actuator can hurry, add --simulate")
-    if arguments.fast and option_values.has_bus(arguments):
+    if arguments.fast and options.has_bus(arguments):
         named = next(name for name in ("port", "interface", "context") if getattr(arguments, name))
         raise ConfigurationError(f"--fast: a bus has its own time, leave --{named} out")
     if arguments.simulate and arguments.port:
@@ -311,6 +310,6 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
             "--simulate: a serial link has two ends, run ehadiag sim on the other one"
         )
     if arguments.simulate:
-        option_values.refuse_two_buses(arguments)
+        options.refuse_two_buses(arguments)
     else:
-        option_values.require_one_bus(arguments)
+        options.require_one_bus(arguments)

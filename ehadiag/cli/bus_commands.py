@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import option_values, options
+from ehadiag.cli import options
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import add_history_option, append_result, history_path
-from ehadiag.cli.result_output import OutputFile, refuse_overwriting
+from ehadiag.cli.options import add_history_option, history_path
+from ehadiag.cli.result_output import OutputFile, append_result, refuse_overwriting
 from ehadiag.cli.simulator_options import add_simulator_options, simulator_settings
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, LEAST_MONITORED
@@ -138,7 +138,7 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
     )
     options.add_screen_options(parser)
     options.add_request_options(parser, "actuator", *options.BUS, "columns", *options.READING)
-    option_values.add_bus_options(parser)
+    options.add_bus_options(parser)
     show_help(
         parser,
         "ehadiag monitor --interface socketcan --channel can0 --history fleet.sqlite",
@@ -155,7 +155,7 @@ def run_monitor(
 
     snapshots: takes the snapshots instead of the screen.
     """
-    option_values.require_bus_or_log(arguments)
+    options.require_bus_or_log(arguments)
     setup = options.setup_of(arguments)
     actuator, bus_map = setup.actuator, setup.bus_map
     reads = [("the log", arguments.log), ("--from", arguments.from_result)]
@@ -192,7 +192,7 @@ def run_monitor(
             least_monitored=arguments.least_monitored,
             duration_s=arguments.duration,
             stop=stop,
-            bitrate=option_values.bitrate_from_options(arguments, bus_map),
+            bitrate=options.bitrate_from_options(arguments, bus_map),
             outlets=outlets,
             snapshots=snapshots or screen.take,
         )
@@ -261,7 +261,7 @@ def _bus_or_log(arguments: argparse.Namespace) -> str | Callable[..., Transport]
     """Return the name of the log, else what opens the bus."""
     if arguments.log is not None:
         return str(arguments.log)
-    return partial(option_values.open_transport, arguments)
+    return partial(options.open_transport, arguments)
 
 
 def _command_words(command: str | list[str] | None) -> list[str]:
@@ -294,7 +294,7 @@ def define_check_bus(parser: argparse.ArgumentParser) -> None:
         "--plot", metavar="FILE", help="draw each channel over time, PNG; a file there is replaced"
     )
     options.add_request_options(parser, "actuator", *options.BUS, *options.READING)
-    option_values.add_bus_options(parser)
+    options.add_bus_options(parser)
     show_help(
         parser,
         "ehadiag check-bus --interface socketcan --channel can0",
@@ -305,7 +305,7 @@ def define_check_bus(parser: argparse.ArgumentParser) -> None:
 
 def run_check_bus(arguments: argparse.Namespace) -> int:
     """Listen and report."""
-    option_values.require_bus_or_log(arguments)
+    options.require_bus_or_log(arguments)
     setup = options.setup_of(arguments)
     from ehadiag.session.bus_calls import check_bus  # noqa: PLC0415
 
@@ -352,7 +352,7 @@ def define_replay(parser: argparse.ArgumentParser) -> None:
         " the test, and the surface moves",
     )
     options.add_request_options(parser, *options.BUS, *options.READING)
-    option_values.add_bus_options(parser)
+    options.add_bus_options(parser)
     show_help(
         parser,
         "ehadiag replay recording.blf --interface socketcan --channel vcan0",
@@ -363,7 +363,7 @@ def define_replay(parser: argparse.ArgumentParser) -> None:
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Play the log."""
-    option_values.require_one_bus(arguments)
+    options.require_one_bus(arguments)
     from firmware_iface.logs.recorder import StoredLog, play_log  # noqa: PLC0415 - loads python-can
 
     # Errors of the log are reported before anything is sent.
@@ -371,7 +371,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     excluded = () if arguments.with_requests else setup.bus_map.request_identifiers
     log = StoredLog(arguments.log, arguments.log_channel, setup.budget, excluded)
     with (
-        option_values.open_transport(arguments, transmit=True) as transport,
+        options.open_transport(arguments, transmit=True) as transport,
         stop_on_signals() as stop,
         progress_bar() as display,
     ):
@@ -415,8 +415,8 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
     )
     options.add_xcp_option(parser, "serve XCP on CAN, for measurement only")
     options.add_request_options(parser, "actuator", *options.BUS)
-    option_values.add_bus_options(parser)
-    option_values.add_protocol_option(parser)
+    options.add_bus_options(parser)
+    options.add_protocol_option(parser)
     add_simulator_options(parser)
     show_help(
         parser,
@@ -442,7 +442,7 @@ def _control_port(control: SimulatorControl | None, port: int | None) -> Iterato
 
 def run_sim(arguments: argparse.Namespace) -> int:
     """Run until stopped."""
-    option_values.require_one_bus(arguments)
+    options.require_one_bus(arguments)
     setup = options.setup_of(arguments)
     actuator, tests, bus_map = setup.actuator, setup.tests, setup.bus_map
     print_compiling_notice(simulation=True, identification=False)
@@ -453,7 +453,7 @@ def run_sim(arguments: argparse.Namespace) -> int:
     core = emulated_computer(actuator, tests, bus_map, xcp=xcp, **settings)
     with (
         _control_port(settings["control"], arguments.control),
-        option_values.open_transport(arguments, transmit=True) as transport,
+        options.open_transport(arguments, transmit=True) as transport,
         stop_on_signals(after_s=arguments.duration) as stop,
     ):
         names = ", ".join(

@@ -25,9 +25,10 @@ from ehadiag.terminal.output import (
     print_status,
     print_text,
     progress_bar,
-    render_for_terminal,
     report_failure,
+    terminal_console,
     worst_exit_code,
+    write_drawn,
     write_output,
 )
 from firmware_iface.errors import (
@@ -107,13 +108,14 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
 
 
 def _print_calibrated(found: Calibrated, *, as_json: bool) -> None:
-    from ehadiag.report.result_tables import calibration_json, print_calibration  # noqa: PLC0415
+    from ehadiag.report.calibration_tables import calibration_json, print_calibration  # noqa: PLC0415
 
     if as_json:
         write_output(calibration_json(found) + "\n")
     else:
-        draw = partial(print_calibration, found)
-        write_output(render_for_terminal(draw, least=TABLE_COLUMNS))
+        console = terminal_console(least=TABLE_COLUMNS)
+        print_calibration(found, console)
+        write_drawn(console)
 
 
 def _write_outputs(
@@ -387,12 +389,13 @@ def _write_test(path: Path, content: bytes) -> None:
 def _print_scores(
     arguments: argparse.Namespace, found: list[tuple[StoredTest, Score]], written: str | None
 ) -> None:
-    from ehadiag.report.result_tables import DESIGN_SCHEMA, print_score, score_tree  # noqa: PLC0415
+    from ehadiag.report.calibration_tables import DESIGN_SCHEMA, print_score, score_tree  # noqa: PLC0415
 
     if not arguments.json:
         for test, scored in found:
-            draw = partial(print_score, test, scored)
-            write_output(render_for_terminal(draw, least=TABLE_COLUMNS))
+            console = terminal_console(least=TABLE_COLUMNS)
+            print_score(test, scored, console)
+            write_drawn(console)
         return
     out = {"schema": DESIGN_SCHEMA, "actuator": arguments.actuator, "scored": score_tree(*found[0])}
     if arguments.out:

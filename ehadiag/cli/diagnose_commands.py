@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import glob
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.batch.journal import list_tests
-from ehadiag.batch.workers import LogInput, expand_logs
+from ehadiag.batch.result_files import is_result_table
 from ehadiag.cli import options
-from ehadiag.cli.batch_run import BatchRun, add_batch_options, diagnose_and_deliver
+from ehadiag.cli.batch_run import BatchRun, LogInput, add_batch_options, readable_name
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import add_history_option, add_history_options, history_path
-from ehadiag.cli.option_values import (
+from ehadiag.cli.options import (
     ActuatorArguments,
     add_actuators_options,
+    add_history_option,
+    add_history_options,
     arguments_of_actuators,
+    history_path,
 )
 from ehadiag.cli.result_output import (
     OutputFile,
@@ -29,11 +35,10 @@ from ehadiag.cli.result_output import (
     refuse_unwritable,
     reserved_stems,
 )
-from ehadiag.core.conventions import fingerprint
-from ehadiag.core.interruption import defer_signals
+from ehadiag.core.conventions import SIGNAL_FILE_SUFFIXES, fingerprint
 from ehadiag.report.rendering import diagnosis_html_page, index_html_page
 from ehadiag.request import Request, request_options
-from ehadiag.result import Log, Result, load_result
+from ehadiag.result import Result, load_result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     counting_bar,
@@ -43,12 +48,17 @@ from ehadiag.terminal.output import (
     print_test_list,
     progress_bar,
     report_failure,
-    worst_exit_code,
 )
-from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
+from firmware_iface.errors import (
+    ConfigurationError,
+    EhadiagError,
+    reason_of,
+)
 from firmware_iface.files import write_file
 from firmware_iface.logs.log_files import FRAME_READERS
-from firmware_iface.recording import Recording
+
+if TYPE_CHECKING:
+    pass
 
 OPTIONS_UNUSED_BY_LIST = (
     "joint", "out", "report", "signals", "history", "hours", "cycles", "results", "resume",
@@ -64,8 +74,7 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
         f"Diagnose actuators from recordings of their bus ({' '.join(FRAME_READERS)}, and these as"
         " .gz)."
     )
-    parser.add_argument("logs", nargs="+", metavar="LOG", help=request_options()["logs"].help)
-    options.add_request_options(parser, "test", "joint", "every_test")
+    options.add_request_options(parser, "logs", "test", "joint", "every_test")
     parser.add_argument(
         "--list", action="store_true", help="list the tests that each log holds, diagnose none"
     )
@@ -98,7 +107,10 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
         )
     # What is wrong with the options is said before anything slow is loaded.
     _refuse_diagnose_contradictions(arguments)
-    setups = [_loaded(unit) for unit in arguments_of_actuators(arguments)]
+    units = arguments_of_actuators(arguments)
+    setups = [options.setup_of(unit.arguments, unit.label) for unit in units]
+    for setup in setups:  # errors of its files come before a log is read
+        _ = setup.sources, setup.actuator, setup.prior
     if arguments.joint and len(setups) > 1:
         raise ConfigurationError("--mapping: --joint is of one actuator, name one mapping")
     outputs = _output_files(arguments)
@@ -110,19 +122,10 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     results = ResultWriter(
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
-    history = results.snapshot()
+    history = results.history.snapshot()
     if history is not None:  # a changed setup loads its files again
         setups = [replace(setup, history=history) for setup in setups]
-    print_compiling_notice()
-    if arguments.merge:
-        codes = {_diagnose_merged(setup, results, inputs) for setup in setups}
-        code = worst_exit_code(codes) if len(codes) > 1 else codes.pop()
-    elif arguments.joint:
-        code = _diagnose_joint(setups[0], results, inputs)
-    else:
-        code = BatchRun(arguments, setups, results, inputs).run()
-    defer_signals()
-    return code
+    return BatchRun(arguments, setups, results, inputs).run()
 
 
 def _refuse_diagnose_contradictions(arguments: argparse.Namespace) -> None:
@@ -147,52 +150,6 @@ def _output_files(arguments: argparse.Namespace) -> list[OutputFile]:
     return [OutputFile(option, name) for option, name in named if name]
 
 
-def _loaded(unit: ActuatorArguments) -> Setup:
-    """Load the setup of one actuator, to raise errors of its files before a log is read."""
-    setup = options.setup_of(unit.arguments, unit.label)
-    _ = setup.sources, setup.actuator, setup.prior
-    return setup
-
-
-def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
-    """Make one estimate from all logs."""
-    together: list[Recording] = []
-    logs: list[Log | None] = []
-    read_s = 0.0
-    codes: list[int] = []
-    for item in inputs:
-        with report_failure(codes, EhadiagError), progress_bar() as progress:
-            reading = setup.read(_readable(item), progress=progress)
-            for recording, log in reading.each():
-                together.append(recording)
-                logs.append(log)
-            read_s += reading.seconds
-    if any(codes):
-        print_status("no joint estimate: not all of the logs could be read")
-        return exit_code_of_inputs(codes)
-    files = [item.name for item in inputs]
-    return diagnose_and_deliver(setup, results, together, files, logs, read_s, "joint")[1]
-
-
-def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
-    """Diagnose one recording that is split over several files."""
-    names = [_readable(item) for item in inputs]
-    with progress_bar() as progress:
-        reading = setup.read(*names, progress=progress)
-    codes = [
-        diagnose_and_deliver(setup, results, [recording], reading.files, [log], reading.seconds)[1]
-        for recording, log in reading.each()
-    ]
-    return worst_exit_code(codes)
-
-
-def _readable(item: LogInput) -> str:
-    """Name of an input; InputOutputError: it was found unreadable when the names were expanded."""
-    if item.why:
-        raise InputOutputError(item.why)
-    return item.name
-
-
 def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
     """Print the tests of one actuator in each log."""
     arguments, suffix = unit.arguments, f" ({unit.label})" if unit.label else ""
@@ -207,7 +164,7 @@ def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:
         with report_failure(codes, EhadiagError):
-            names = [_readable(item) for item in group]
+            names = [readable_name(item) for item in group]
             with progress_bar() as progress:
                 tests = list(list_tests(setup, *names, progress=progress))
             print_test_list(", ".join(names) + suffix, tests, as_json=arguments.json)
@@ -344,3 +301,90 @@ def _is_same_diagnosis(found: Result, stored: Result) -> bool:
         if item.estimate is not None and abs(item.value - other.value) >= 1e-3:
             return False
     return True
+
+
+STANDARD_INPUT_NAME = "-"
+MAX_LIST_BYTES = 64 << 20
+"""A list of a hundred thousand long names is a tenth of it."""
+
+
+def expand_logs(names: Iterable[str], report: Callable[[str], None]) -> list[LogInput]:
+    """Return the recordings that arguments stand for, in their order and as often as named.
+
+    A folder stands for all recordings in it and below, in the order of their names, but not for
+    hidden ones, what lies in hidden folders or behind links, and tables and signals of results; a
+    pattern (`*`, `?`, `[…]`, `**`), where there is no file of that name, for what it matches; `-`
+    for the names on standard input, one a line, or ended by null characters.
+
+    names: arguments of the command; report: takes a sentence on what of a folder is left out. A
+    name that stands for no recording is in the list too, with the reason. ConfigurationError: the
+    list on standard input is longer than any list of names.
+    """
+    return [
+        item
+        for name in names
+        for path in (_names_on_standard_input() if name == STANDARD_INPUT_NAME else [name])
+        for item in _expand_path(path, report)
+    ]
+
+
+def _expand_path(name: str, report: Callable[[str], None]) -> Iterator[LogInput]:
+    if os.path.isdir(name):
+        yield from _expand_folder(name, report)
+    elif glob.has_magic(name) and not os.path.lexists(name):
+        matches = sorted(glob.glob(name, recursive=True))
+        for match in matches:
+            if os.path.isdir(match):
+                yield from _expand_folder(match, report)
+            else:
+                yield LogInput(match)
+        if not matches:
+            yield LogInput(name, f"pattern {name}: matches no file")
+    else:
+        yield LogInput(name)
+
+
+def _expand_folder(folder: str, report: Callable[[str], None]) -> Iterator[LogInput]:
+    from firmware_iface.logs.log_files import kind_of, known_suffixes  # noqa: PLC0415
+
+    known = known_suffixes()
+    links: list[str] = []
+    inside = []
+    closed: list[OSError] = []
+    for place, folders, names in os.walk(folder, onerror=closed.append):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        links += [path for name in folders if os.path.islink(path := os.path.join(place, name))]
+        inside += [
+            os.path.join(place, name)
+            for name in names
+            if not name.startswith(".") and kind_of(Path(name)) in known
+        ]
+    ours = [name for name in inside if is_result_table(Path(name))]
+    signals = [name for name in inside if name.endswith(SIGNAL_FILE_SUFFIXES)]
+    for left_out, why in (
+        (links, "a link to a folder is not followed, name the folder to read it"),
+        (ours, "a table of results is no recording"),
+        (signals, "signals of a result are no recording"),
+    ):
+        if left_out:
+            more = f" and {len(left_out) - 1} more" if len(left_out) > 1 else ""
+            report(f"folder {folder}: {why}: {min(left_out)}{more}")
+    recordings = sorted(set(inside).difference(ours, signals))
+    for error in closed:
+        yield LogInput(error.filename, f"folder {error.filename}: {reason_of(error)}")
+    if not recordings and not closed:
+        yield LogInput(folder, f"folder {folder}: no recording in it ({', '.join(sorted(known))})")
+    yield from map(LogInput, recordings)
+
+
+def _names_on_standard_input() -> list[str]:
+    """Names on standard input."""
+    stream = getattr(sys.stdin, "buffer", None)
+    if stream is None:  # a text put in its place
+        content = sys.stdin.read(MAX_LIST_BYTES + 1)
+    else:
+        content = os.fsdecode(stream.read(MAX_LIST_BYTES + 1))
+    if len(content) > MAX_LIST_BYTES:
+        raise ConfigurationError(f"standard input: more than {MAX_LIST_BYTES} bytes of names")
+    lines = content.split("\0") if "\0" in content else content.splitlines()
+    return [line for line in lines if line.strip()]

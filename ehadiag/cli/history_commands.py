@@ -11,18 +11,19 @@ from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import (
+from ehadiag.cli.options import (
     HISTORY_VARIABLE,
     add_history_option,
     add_usage_options,
     history_path,
     open_named_history,
+    unit_number,
     units_of,
     usage_from_options,
+    user_history_path,
 )
-from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
-from ehadiag.core.conventions import utc_time_text
+from ehadiag.core.conventions import shown_date, utc_time_text
 from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.history.records import (
     DIAGNOSIS_TABLE,
@@ -31,15 +32,22 @@ from ehadiag.history.records import (
     MaintenanceEvent,
     counted_entries,
     current_utc_text,
+    entries_from_csv,
     entry_object,
     event_object,
+    history_csv,
+    history_parquet,
     of_unit,
-    user_history_path,
 )
 from ehadiag.model.severities import FAULT_LAWS
-from ehadiag.report.head import shown_date
 from ehadiag.report.rendering import isolated_png
-from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
+from ehadiag.terminal.output import (
+    print_status,
+    print_text,
+    terminal_console,
+    write_drawn,
+    write_output,
+)
 from firmware_iface.errors import (
     ConfigurationError,
     InputOutputError,
@@ -205,7 +213,9 @@ def _list(arguments: argparse.Namespace) -> None:
     rows += [(item.when, _event_row(item)) for item in events]
     for _, row in sorted(rows):
         table.add_row(*(printable(row[at]) for at in shown))
-    write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
+    console = terminal_console()
+    console.print(table, crop=False)
+    write_drawn(console)
 
 
 def _show(arguments: argparse.Namespace) -> None:
@@ -215,8 +225,6 @@ def _show(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.tables import history_csv, history_parquet  # noqa: PLC0415
-
     entries, _ = _read(arguments)
     if arguments.out is None:
         write_output(history_csv(entries))
@@ -229,8 +237,6 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.tables import entries_from_csv  # noqa: PLC0415
-
     # A million rows.
     content = read_small_file(Path(arguments.file), 200_000_000, "table")
     try:

@@ -18,7 +18,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import ehadiag
-from ehadiag.cli.command_parser import CommandParser, refuse_former_options
+from ehadiag.cli.command_parser import (
+    DEFAULTS_FILE_NAME,
+    CommandParser,
+    apply_defaults,
+    refuse_former_options,
+)
 from ehadiag.core.interruption import (
     INTERRUPTED_EXIT_CODE,
     ignore_signals,
@@ -179,11 +184,7 @@ def parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     refuse_former_options(called, given)
     used: Sequence[str] = ()
     if command in commands:
-        from ehadiag.cli import defaults  # noqa: PLC0415 - not for the help of all commands
-
-        used, ignored = defaults.apply_defaults(
-            command, called, given, lambda: parser_and_commands()[1]
-        )
+        used, ignored = apply_defaults(command, called, given, lambda: parser_and_commands()[1])
         for text in ignored:
             print_status(text)
     arguments, rest = parser.parse_known_args(given)
@@ -193,7 +194,7 @@ def parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         getattr(arguments, files).extend(late)
     elif rest:
         called.refuse_unknown(rest)
-    if used and (arguments.verbose or defaults.DEFAULTS_FILE_NAME in used):
+    if used and (arguments.verbose or DEFAULTS_FILE_NAME in used):
         print_status(f"defaults from {', '.join(used)}")
     if arguments.verbose:
         print_verbose(arguments)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import hashlib
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -18,18 +19,19 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.assess.verdict import Levels, Verdict
-from ehadiag.cli.defaults import DEFAULTS_FILE_NAME, user_defaults_file
-from ehadiag.cli.history_options import HistoryWriter, history_path
+from ehadiag.cli.command_parser import DEFAULTS_FILE_NAME, user_defaults_file
+from ehadiag.cli.options import history_path, usage_from_options
 from ehadiag.core.conventions import MAX_RESULT_BYTES, SIGNAL_FILE_SUFFIXES
 from ehadiag.core.interruption import defer_signals
-from ehadiag.report.rendering import diagnosis_html_page
+from ehadiag.report.rendering import diagnosis_html_page, diagnosis_png
 from ehadiag.result import Origin, Result
 from ehadiag.terminal.output import (
     print_status,
     print_text,
-    render_for_terminal,
     report_failure,
+    terminal_console,
     worst_exit_code,
+    write_drawn,
     write_output,
 )
 from firmware_iface.errors import (
@@ -42,7 +44,8 @@ from firmware_iface.errors import (
 from firmware_iface.files import RESULT_MODE, Folder, write_errors
 
 if TYPE_CHECKING:
-    from ehadiag.history.store import HistorySnapshot
+    from ehadiag.history.records import Usage
+    from ehadiag.history.store import History, HistorySnapshot
     from ehadiag.prognosis.units import Prognosis
 
 INPUT_FILE_OPTIONS = ("actuator", "mapping", "dbc", "test", "prior")
@@ -187,7 +190,8 @@ class ResultWriter:
         self._arguments = arguments
         self._folder = folder
         self._names = set(taken)
-        self._keeper = HistoryWriter(arguments)
+        self.history = HistoryWriter(arguments)
+        """Health history that the results are kept in."""
         if arguments.report and folder is None:
             raise ConfigurationError("--report: name by --out the folder where the page goes")
         self._signals = tuple(dict.fromkeys(arguments.signals))
@@ -201,26 +205,17 @@ class ResultWriter:
         self.stopped = False
         """Whether a signal came while a result was brought out."""
 
-    @property
-    def history(self) -> Path | None:
-        """Health history that the results are kept in; None: in none."""
-        return self._keeper.place
-
-    def snapshot(self) -> HistorySnapshot | None:
-        """Return the history as it is now; None where there is none."""
-        return self._keeper.snapshot()
-
     def load(self) -> None:
         """Load what printing needs: a verdict must not wait for it."""
         if not self._arguments.json:
-            import ehadiag.report.result_tables  # noqa: PLC0415
+            import ehadiag.report.head  # noqa: PLC0415
 
-            render_for_terminal(lambda _: None)
+            terminal_console()
         if self._arguments.report:
             import ehadiag.report.report_pages  # noqa: F401, PLC0415
 
     def deliver(
-        self, result: Result, name: str, draw: Callable[[], bytes] | None, *, alone: bool = True
+        self, result: Result, name: str, picture: bytes | None = None, *, alone: bool = True
     ) -> int:
         """Write and print one result; return its exit code.
 
@@ -228,8 +223,8 @@ class ResultWriter:
         `worst_exit_code`). From here on signals do not change it: the first leaves the picture out,
         the second what is not out yet.
 
-        name: of the files, without suffix; made safe, and numbered where it is taken. draw: makes
-        the picture; None: there is none. alone: whether the time of a forecast is worth it.
+        name: of the files, without suffix; made safe, and numbered where it is taken. picture: PNG;
+        None: drawn here, where there are samples. alone: whether a forecast is worth its time.
         """
         came = defer_signals()
         codes = [result.exit_code]
@@ -238,12 +233,12 @@ class ResultWriter:
             with report_failure(codes):
                 stem = self._write_json(result, plain_name(name))
             with report_failure(codes):
-                self._keeper.keep(result)
+                self.history.keep(result)
             written = [f"{stem}.json"]
             with report_failure(codes):
                 self._print(result, self._prognosis(result) if alone else None)
             if stem is not None and self._folder is not None:
-                for what, suffix, content in self._attachments(result, draw):
+                for what, suffix, content in self._attachments(result, picture):
                     if came.is_set():
                         break
                     name = f"{stem}{suffix}"
@@ -280,7 +275,7 @@ class ResultWriter:
 
         name: of the files, without suffix, as for `deliver`.
         """
-        return self._keeper.has(result) and self._has_files(result, plain_name(name))
+        return self.history.has(result) and self._has_files(result, plain_name(name))
 
     def _has_files(self, result: Result, wanted: str) -> bool:
         folder = self._folder
@@ -306,7 +301,7 @@ class ResultWriter:
 
     def _prognosis(self, result: Result) -> Prognosis | None:
         """Forecast the unit of a result that asks by when, from the history; some 0.3 s."""
-        place = self.history
+        place = self.history.place
         if place is None or result.serial is None or result.verdict is not Verdict.DEGRADED:
             return None
         from ehadiag.prognosis.units import forecast  # noqa: PLC0415 - loads numpy
@@ -320,14 +315,12 @@ class ResultWriter:
         if self._arguments.json:
             write_output(result.to_json() + "\n")
             return
-        from ehadiag.report.result_tables import print_result  # noqa: PLC0415
+        from ehadiag.report.head import print_result  # noqa: PLC0415
 
         verbose = self._arguments.verbose
-        write_output(
-            render_for_terminal(
-                lambda console: print_result(result, console, prognosis, verbose=verbose)
-            )
-        )
+        console = terminal_console()
+        print_result(result, console, prognosis, verbose=verbose)
+        write_drawn(console)
 
     def _write_json(self, result: Result, wanted: str) -> str | None:
         """Write the object under the first name that no other recording's result has."""
@@ -358,11 +351,11 @@ class ResultWriter:
         raise AssertionError("numbers have no end")
 
     def _attachments(
-        self, result: Result, draw: Callable[[], bytes] | None
+        self, result: Result, picture: bytes | None
     ) -> Iterator[tuple[str, str, Callable[[], bytes]]]:
         """Kind, suffix and content of what stands beside a result."""
-        if draw is not None and self.pictures:
-            yield "picture", ".png", draw
+        if self.pictures and (picture is not None or result.can_be_drawn):
+            yield "picture", ".png", lambda: picture or diagnosis_png(result)
         if self._arguments.report:
             yield "report", ".html", partial(self._page, result)
         for kind in self._signals if result.can_be_drawn else ():
@@ -370,7 +363,7 @@ class ResultWriter:
 
     def _page(self, result: Result) -> bytes:
         levels = Levels(self._arguments.advisory, self._arguments.limit)
-        return diagnosis_html_page(result, levels, self._keeper.place)
+        return diagnosis_html_page(result, levels, self.history.place)
 
 
 def _signals(result: Result, kind: str) -> bytes:
@@ -402,3 +395,101 @@ def _is_same_recording(folder: Folder, name: str, result: Result) -> bool:
 def _recording_identity(origin: Origin) -> tuple[object, ...]:
     """What tells one recording from others."""
     return origin.source, origin.date, origin.serial, origin.log
+
+
+def append_result(
+    place: Path, result: Result, usage: Usage, *, simulated: bool = False, create: bool = True
+) -> None:
+    """Append a result to a history; InputOutputError where it cannot be, and nothing of it is."""
+    from ehadiag.history.records import history_entry  # noqa: PLC0415
+    from ehadiag.history.store import History  # noqa: PLC0415
+
+    entry = history_entry(result, usage, simulated=simulated)
+    try:
+        with History(place, create=create) as history:
+            history.append(entry)
+    except ConfigurationError as error:  # exchanged since the call began
+        raise InputOutputError(str(error)) from None
+
+
+class HistoryWriter:
+    """Appends the diagnoses of one call to the history, where there is one.
+
+    arguments: the parsed command line. ConfigurationError: hours or cycles without a history; the
+    file is none; InputOutputError: the history cannot be opened.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._kept: set[bytes] | None = None
+        """Digests of what was in it when that was asked first."""
+        self.place = self._place()
+        """Of the history; None: nothing is kept."""
+        if self.place is not None:
+            self._try()
+        elif arguments.hours is not None or arguments.cycles is not None:
+            raise ConfigurationError(
+                "--hours, --cycles: no health history to keep them in: name one by --history, or"
+                " begin one by ehadiag history init"
+            )
+
+    def keep(self, result: Result) -> None:
+        """Append a result; InputOutputError where it cannot be, and then nothing of it is."""
+        if self.place is None:
+            return
+        append_result(
+            self.place, result, usage_from_options(self._arguments), simulated=self._simulated
+        )
+
+    def snapshot(self) -> HistorySnapshot | None:
+        """Return the history as it is now; None where there is none."""
+        if self.place is None or not self.place.exists():
+            return None
+        from ehadiag.history.store import HistorySnapshot  # noqa: PLC0415
+
+        with self._open() as history:
+            return HistorySnapshot(self.place, history.last_number)
+
+    def has(self, result: Result) -> bool:
+        """Whether a result need not be appended: it was, or there is no history."""
+        if self.place is None:
+            return True
+        if not self.place.exists():
+            return False
+        if self._kept is None:
+            with self._open() as history:
+                self._kept = {_line_digest(kept) for kept in history.results()}
+        return _line_digest(result.to_json()) in self._kept
+
+    @property
+    def _simulated(self) -> bool:
+        return bool(getattr(self._arguments, "simulate", False))
+
+    def _place(self) -> Path | None:
+        if self._arguments.no_history:
+            if self._arguments.history:
+                raise ConfigurationError("--history and --no-history exclude each other")
+            return None
+        if self._simulated and not self._arguments.history:
+            return None  # a simulated unit is none of the fleet's unless somebody wants it there
+        return history_path(self._arguments)
+
+    def _try(self) -> None:
+        """Say before a test begins or a log is read what is wrong; make no file yet."""
+        assert self.place is not None
+        if os.path.lexists(self.place):
+            self._open().close()
+        elif not os.access(self.place.parent, os.W_OK | os.X_OK):
+            raise InputOutputError(
+                f"history {self.place}: cannot be opened: no such folder, or no right to it"
+            )
+
+    def _open(self) -> History:
+        from ehadiag.history.store import History  # noqa: PLC0415
+
+        assert self.place is not None
+        return History(self.place, create=True)
+
+
+def _line_digest(line: str) -> bytes:
+    return hashlib.sha256(line.encode()).digest()

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import (
+from ehadiag.cli.options import (
     add_history_option,
     add_usage_options,
     open_named_history,
@@ -22,7 +22,7 @@ from ehadiag.cli.history_options import (
     usage_from_options,
 )
 from ehadiag.core.interruption import ignore_interrupt_in_worker
-from ehadiag.terminal.output import counting_bar, print_text, render_for_terminal, write_output
+from ehadiag.terminal.output import counting_bar, print_text, terminal_console, write_drawn
 from firmware_iface.errors import ConfigurationError, InputOutputError
 
 if TYPE_CHECKING:
@@ -108,13 +108,13 @@ def run_rul(arguments: argparse.Namespace) -> int:
         for place, item in enumerate(found):
             before = (text, ahead[place]) if ahead else None
             print_text(json.dumps(prognosis_tree(item, before), allow_nan=False))
-    elif arguments.all:
-        write_output(render_for_terminal(lambda console: print_urgencies(found, console, ahead)))
+        return 0
+    console = terminal_console()
+    if arguments.all:
+        print_urgencies(found, console, ahead)
     else:
-        before = (text, ahead[0]) if ahead else None
-        write_output(
-            render_for_terminal(lambda console: print_prognosis(found[0], console, before))
-        )
+        print_prognosis(found[0], console, (text, ahead[0]) if ahead else None)
+    write_drawn(console)
     return 0
 
 

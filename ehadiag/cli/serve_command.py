@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.cli import bit_command, bus_commands, option_values, options
+from ehadiag.cli import bit_command, bus_commands, options
 from ehadiag.cli.command_parser import show_help
-from ehadiag.cli.history_options import add_history_options, history_path
+from ehadiag.cli.options import add_history_options, history_path
 from ehadiag.cli.result_output import open_output_folder
 from ehadiag.request import TEST
 from ehadiag.terminal.output import print_status
@@ -72,8 +72,8 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
     )
     options.add_xcp_option(parser, "tests measure command and channels by XCP, not by telemetry")
     options.add_request_options(parser, "actuator", *options.BUS)
-    option_values.add_bus_options(parser)
-    option_values.add_protocol_option(parser)
+    options.add_bus_options(parser)
+    options.add_protocol_option(parser)
     add_history_options(parser)
     options.add_request_options(parser, *options.LEVELS)
     show_help(
@@ -91,14 +91,14 @@ def run_serve(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--port {arguments.port}: names a serial port now; the page's is --http-port"
         )
-    watched = option_values.has_bus(arguments)
+    watched = options.has_bus(arguments)
     if arguments.simulate and not arguments.allow_tests:
         raise ConfigurationError("--simulate: nothing is simulated without --allow-tests")
     if not arguments.allow_tests and (arguments.xcp or arguments.protocol != "native"):
         named = "xcp" if arguments.xcp else "protocol"
         raise ConfigurationError(f"--{named}: no test is requested without --allow-tests")
     if not watched and not arguments.simulate:
-        option_values.require_one_bus(arguments)
+        options.require_one_bus(arguments)
     names = arguments.tests or ["open", "closed"]
     tests = {resolve_test(name).name: name for name in names}
     setup = options.setup_of(arguments)
@@ -151,7 +151,7 @@ def _check_bus_options(arguments: argparse.Namespace) -> None:
     """Refuse wrong options of the bus at once; a bus that is not there yet may come."""
     with (
         contextlib.suppress(InputOutputError),
-        option_values.open_transport(arguments, transmit=False),
+        options.open_transport(arguments, transmit=False),
     ):
         pass
 

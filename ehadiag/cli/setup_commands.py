@@ -17,7 +17,7 @@ from ehadiag.cli.result_output import OutputFile, open_output_folder, refuse_ove
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.request import TEST
-from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
+from ehadiag.terminal.output import print_status, print_text, terminal_console, write_drawn
 from firmware_iface.errors import (
     ConfigurationError,
     InputOutputError,
@@ -115,7 +115,9 @@ def run_tests(arguments: argparse.Namespace) -> int:
             f"{test.rate:g} Hz",
             test.description,
         )
-    write_output(render_for_terminal(lambda console: console.print(table)))
+    console = terminal_console()
+    console.print(table)
+    write_drawn(console)
     return 0
 
 
@@ -269,13 +271,12 @@ def run_warmup(_arguments: argparse.Namespace) -> int:
     """Compile."""
     begin = time.perf_counter()
     from ehadiag.compile import libraries  # noqa: PLC0415 - not for help texts
-    from ehadiag.compile.sources import cache_folder  # noqa: PLC0415
     from firmware_iface.bus_map import default_map  # noqa: PLC0415
 
     absent = libraries.missing(libraries.SHIPPED)
     libraries.prepare(absent, print_status)
     default_map()  # keeps what it finds in the DBC
-    folder = cache_folder()
+    folder = libraries.cache_folder()
     took = f"{time.perf_counter() - begin:.1f} s"
     if not absent:
         print_status("all kernels are there")

@@ -151,13 +151,3 @@ def main() -> None:
     except EhadiagError as error:
         made = error
     sys.stdout.buffer.write(pickle.dumps(made))
-
-
-def tool_versions() -> dict[str, str]:
-    """Versions of what makes the code; empty where there is none of it."""
-    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - reads files
-
-    try:
-        return {name: version(name) for name in ("numba", "llvmlite")}
-    except PackageNotFoundError:
-        return {}

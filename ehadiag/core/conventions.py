@@ -131,3 +131,13 @@ LEAST_MONITORED: Final = 0.5
 """Share of the ticks below which too little was monitored, 1: what is left is no majority."""
 FALSE_ALARM_INTERVAL_H: Final = 100.0
 """Mean time between false alarms of a monitor as a whole, h."""
+
+
+def finite(value: float | None) -> float | None:
+    """Return a number as results hold it: None for NaN and the infinite."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def shown_date(date: str) -> str:
+    """Return a date of a result, UTC and ISO 8601, as people read it."""
+    return f"{date[:10]} {date[11:16]} UTC"

@@ -16,16 +16,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.acceptance import residual_limits
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, residual_limits
 from ehadiag.compile.elementary import (
     C_FUNCTIONS,
     ROUNDING_FUNCTIONS,
     square_root,
 )
 from ehadiag.compile.jit import Array
-from ehadiag.compile.libraries import object_files
-from ehadiag.compile.sources import source_hash
+from ehadiag.compile.libraries import object_files, source_hash, tool_versions
 from ehadiag.compile.vector import BYTES_PER_NUMBER
 from ehadiag.compile.worker import (
     CFunction,
@@ -33,7 +31,6 @@ from ehadiag.compile.worker import (
     PointerArgument,
     Processor,
     TableArgument,
-    tool_versions,
 )
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, __version__

@@ -10,7 +10,9 @@ import msgspec
 from markupsafe import Markup
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.report.head import advised, percent, plain_name, shown_date, two_digits
+from ehadiag.core.conventions import shown_date
+from ehadiag.report.head import advised, percent, plain_name
+from ehadiag.report.prognosis_tables import two_digits
 from firmware_iface.errors import printable
 
 if TYPE_CHECKING:

@@ -1,34 +1,39 @@
-"""The head of a result: what is wrong, how bad, what to do by when. Every surface shows the same.
+"""The head of a result: what is wrong, how bad, what to do by when; and the text of a result.
 
 Terminal, report, page of `serve` and notebook show a `Head`; none of them words a verdict itself.
 """
 
 from __future__ import annotations
 
+import io
+import math
 import re
+import textwrap
 import tomllib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
 
 import msgspec
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from ehadiag.assess.verdict import Verdict
-from ehadiag.core.conventions import display_unit
-from firmware_iface.errors import EhadiagError
+from ehadiag.assess.verdict import Levels, Verdict
+from ehadiag.core.conventions import PIPE_COLUMNS, display_unit, shown_date, to_precision
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN
+from firmware_iface.errors import printable
 from firmware_iface.stored_test import bundled_tests
 
 if TYPE_CHECKING:
-    from ehadiag.assess.verdict import Levels
-    from ehadiag.estimate import Severity
+    from ehadiag.estimate import Effect, Severity
     from ehadiag.prognosis.units import Prognosis
-    from ehadiag.result import Result
+    from ehadiag.request import Request
+    from ehadiag.result import Onboard, Result
 
 INCONCLUSIVE = "INCONCLUSIVE"
 """Word for a test that ran and was identified, but not explained; its verdict is NOT TESTED."""
-LEAST_CHANCE = 0.01
-"""Chance, 1, that is worth a word and a number."""
 
 
 class Bar(msgspec.Struct, frozen=True):
@@ -124,8 +129,6 @@ CUT_NOTE = re.compile(r"the (last|first) .* are missing")
 NO_TIME = "By when: not known from one test; a health history tells (ehadiag history init)."
 UNEXPLAINED = "does not explain the recording"
 """Words of the reason for which a culprit is looked for."""
-WIDE_RANGE = 10.0
-"""Ratio of the ends of an interval, 1, beyond which no time is given, only the earliest one."""
 
 
 @cache
@@ -146,8 +149,11 @@ def verdict_word(verdict: str, *, identified: bool) -> str:
     return verdict.replace("_", " ")
 
 
-def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) -> Head:
-    """Return the content of a result's head."""
+def head_of(
+    result: Result, asked: Levels | None = None, prognosis: Prognosis | None = None
+) -> Head:
+    """Return the content of a result's head; `asked`: other levels than those of its request."""
+    levels = asked or result.request
     untested = result.verdict is Verdict.NOT_TESTED
     bars = sorted(
         (_bar(item, levels, untested) for item in result.as_shown.severities.values()),
@@ -175,52 +181,16 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
 def _by_when(bars: Sequence[Bar], prognosis: Prognosis | None) -> tuple[str, ...]:
     """Say by when to act on the severities between the levels, worst first."""
     worn = [bar.symbol for bar in bars if bar.state == "DEGRADED"]
-    known = remaining_sentences(prognosis, worn)[:1] if prognosis else []
+    known: list[str] = []
+    if prognosis:
+        from ehadiag.report.prognosis_tables import remaining_sentences  # noqa: PLC0415 - heavy
+
+        known = remaining_sentences(prognosis, worn)[:1]
     if known or not worn or any(bar.state == "FAULT" for bar in bars):
         return tuple(known)
     futures = prognosis.forecasts if prognosis else ()
     why = [item.remaining[-1].why for item in futures if item.name == worn[0]]
     return (f"By when is not known yet: {why[0]}." if why else NO_TIME,)
-
-
-def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = None) -> list[str]:
-    """Return when severities reach the limit, the soonest first; only those with a number.
-
-    prognosis: what the history says; names: of the severities; None: all. Returns sentences; one
-    whose interval is wide says only the earliest time.
-    """
-    found = []
-    for item in prognosis.forecasts:
-        left = item.remaining[-1]
-        if names is not None and item.name not in names:
-            continue
-        if left.median is None or left.low is None or left.high is None or left.reached:
-            continue
-        unit = "h" if prognosis.unit == "hours" else prognosis.unit
-        low, high = two_digits(max(left.low, 0.0)), two_digits(left.high)
-        when = f"reaches its limit in about {two_digits(left.median)} {unit}"
-        when += f" (80 %: {low} to {high} {unit})"
-        if left.low > 0.0 and left.high > WIDE_RANGE * left.low:
-            when = f"reaches its limit not before about {low} {unit}"
-        past = left.chance_within(0.0) or 0.0
-        if left.median <= 0.0:
-            when = f"may have reached its limit: {chance_text(past)}"
-        elif left.low <= 0.0:
-            when += f"; it may be past it: {chance_text(past)}"
-        text = f"{plain_name(item.name)} {when}{_counted(prognosis)}."
-        found.append((left.median, text[0].upper() + text[1:]))
-    return [text for _, text in sorted(found)]
-
-
-def _counted(prognosis: Prognosis) -> str:
-    """Say from when on times left are counted, where that is not the day of the last test."""
-    last = (prognosis.last_test or prognosis.now)[:10]
-    if last == prognosis.now[:10]:
-        return ""
-    if prognosis.usage_now is None:
-        return f", from the test of {last}"
-    unit = "h" if prognosis.unit == "hours" else prognosis.unit
-    return "" if unit == "days" else f", from now at about {two_digits(prognosis.usage_now)} {unit}"
 
 
 @cache
@@ -245,11 +215,6 @@ def stored_test_name(name: str | None) -> str:
     return f"{' and '.join(several)} test{'s' * (len(loops) > 1)}"
 
 
-def two_digits(value: float) -> str:
-    """Write a number with two digits that count."""
-    return f"{float(f'{value:.2g}'):g}"
-
-
 def percent(value: float, *others: float) -> str:
     """Write a share in percent, with as many digits as tell it from other ones."""
     for digits in range(3):
@@ -257,13 +222,6 @@ def percent(value: float, *others: float) -> str:
         if all(text != f"{100.0 * other:.{digits}f}" for other in others if other != value):
             break
     return f"{text} %"
-
-
-def chance_text(chance: float) -> str:
-    """Write a chance in percent; none is promised or ruled out."""
-    if not LEAST_CHANCE <= chance <= 1.0 - LEAST_CHANCE:
-        return "below 1 %" if chance < LEAST_CHANCE else "above 99 %"
-    return f"{100.0 * chance:.0f} %"
 
 
 def plain_name(name: str) -> str:
@@ -282,21 +240,6 @@ def full_name(name: str) -> str:
     return name if plain == name else f"{plain} ({name})"
 
 
-def kept_advice(line: str) -> dict[str, str]:
-    """Return what to do about each severity by its name.
-
-    line: JSON result that a history keeps; without one, as of a row that was imported, the advice
-    is that of any actuator.
-    """
-    from ehadiag.core.actuator import Advice  # noqa: PLC0415 - not for help texts
-    from ehadiag.result import Result  # noqa: PLC0415
-
-    try:
-        return {item.name: item.advice for item in Result.from_json(line).severities.values()}
-    except (EhadiagError, ValueError):
-        return msgspec.structs.asdict(Advice())
-
-
 def advised(advice: str, *, at_once: bool) -> str:
     """Return what to do as a sentence, at once or planned; empty without an advice."""
     if not advice:
@@ -304,12 +247,7 @@ def advised(advice: str, *, at_once: bool) -> str:
     return f"Act now: {advice}." if at_once else f"Plan to {advice}."
 
 
-def shown_date(date: str) -> str:
-    """Return a date of a result, UTC and ISO 8601, as people read it."""
-    return f"{date[:10]} {date[11:16]} UTC"
-
-
-def _bar(item: Severity, levels: Levels, untested: bool) -> Bar:
+def _bar(item: Severity, levels: Levels | Request, untested: bool) -> Bar:
     value, state, standing = item.estimate, "", "not known"
     if value is not None and untested:
         standing = "no verdict"
@@ -329,7 +267,7 @@ def _bar(item: Severity, levels: Levels, untested: bool) -> Bar:
     )
 
 
-def _found(result: Result, bars: Sequence[Bar], levels: Levels) -> tuple[str, ...]:
+def _found(result: Result, bars: Sequence[Bar], levels: Levels | Request) -> tuple[str, ...]:
     """Say what is worn, worst first, with what to do."""
     both = (levels.advisory, levels.limit)
     out = []
@@ -404,3 +342,256 @@ def _explained(result: Result) -> tuple[Reason, ...]:
 
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+STATE_STYLES = {
+    "HEALTHY": "bold green",
+    "DEGRADED": "bold yellow",
+    "FAULT": "bold red",
+    "NOT_TESTED": "bold",
+}
+NAMED_COLUMNS = 76
+"""Columns from which on the table of the severities has their plain names too."""
+FLAG_REMARKS = {AT_BOUND: "at its bound", NOT_SHOWN: "not shown by the test"}
+"""What the table says of a severity's flags."""
+
+
+def diagnosis_text(result: Result, *, verbose: bool = False) -> str:
+    """Return a result as plain lines of text, the last one without its end."""
+    console = Console(
+        file=io.StringIO(), width=PIPE_COLUMNS, highlight=False, record=True, force_jupyter=False
+    )
+    print_result(result, console, verbose=verbose)
+    return "\n".join(line.rstrip() for line in console.export_text().splitlines())
+
+
+def diagnosis_html(result: Result) -> str:
+    """Return a result as a piece of HTML for a notebook, its text escaped."""
+    from ehadiag.report.page_parts import templates_of  # noqa: PLC0415 - bokeh is slow
+
+    head = head_of(result)
+    template = templates_of("ehadiag.report").get_template("notebook.html.j2")
+    shown = result.as_shown.severities
+    severities = [shown[bar.symbol] for bar in head.bars]
+    return template.render(head=head, severities=severities, percent=percent)
+
+
+def print_result(
+    result: Result, console: Console, prognosis: Prognosis | None = None, *, verbose: bool = False
+) -> None:
+    """Print a result: its head, then the numbers.
+
+    verbose: the course of the search, reasons in terms of the field, numbers beside no verdict, and
+    every effect that was estimated, not only those that are not 0 beyond doubt.
+    """
+    head = head_of(result, prognosis=prognosis)
+    _print_head(head, result, console)
+    if verbose:
+        for reason in result.reasons:
+            print_line(console, f"- {reason}")
+    relied_on = verbose or result.relied_on
+    if not relied_on:
+        print_line(console, head.best_fit)
+    elif result.estimated:
+        console.print(_severities(head, result, console), crop=False)
+    if result.identified and verbose:
+        for name in ("first", "search"):
+            values = (f"{k} {_number(getattr(v, name), 4)}" for k, v in result.severities.items())
+            print_line(console, f"after the {name}: {', '.join(values)}")
+    onboard = result.origins[0].onboard if len(result.origins) == 1 else None
+    if onboard is not None:
+        unexplained = onboard.verdict == Verdict.NOT_TESTED.name
+        print_line(console, _on_board(onboard, result, verbose or (relied_on and not unexplained)))
+    if result.other and relied_on:
+        console.print(_limited(result), crop=False)
+    effects = [item for item in result.effects if verbose or _is_shown(item)]
+    effects = [item for item in effects if item.limit is None]
+    if effects and relied_on:
+        print_line(console, f"also estimated: {', '.join(map(_size, effects))}")
+    print_line(console, _quality_text(result))
+    cut_off = any(item.cause.startswith(CUT_OFF) for item in head.reasons)
+    for note in result.notes:
+        if verbose or not (cut_off and CUT_NOTE.match(note)):  # the head says it
+            print_line(console, f"note: {note}")
+    if result.identified:
+        print_line(console, _effort_text(result))
+
+
+def _print_head(head: Head, result: Result, console: Console) -> None:
+    indent = " " * (len(head.word) + 2)
+    first, *rest = head.sentences or ("",)
+    lines = _wrapped(first, console, len(indent))
+    text = Text(head.word, style=STATE_STYLES[head.verdict])
+    text.append(f"  {lines[0]}", style="not bold default")
+    console.print(text, soft_wrap=True)
+    arrow = "→" if _unicode(console) else ">"
+    actions = [f"{arrow} {action}" for action in head.actions]
+    for sentence in ("\n".join(lines[1:]), *rest, *actions):
+        for line in _wrapped(sentence, console, len(indent)) if sentence else ():
+            console.print(indent + line, soft_wrap=True)
+    facts = ", ".join(f"{label} {printable(value)}".lstrip() for label, value in head.facts)
+    print_line(console, facts)
+    print_line(console, f"recording {printable(result.source)}")
+    for item in (item for reason in head.reasons for item in reason.evidence):
+        print_line(console, f"- {item}")
+    if result.identified and head.drawn:
+        for bar in head.drawn:
+            console.print(_drawn_bar(bar, head, console), soft_wrap=True)
+        advisory, limit = _marks(console)
+        levels = (
+            f"{advisory} advisory {percent(head.advisory)}, {limit} limit {percent(head.limit)}"
+        )
+        start = max(min(27, console.width - len(levels)), 0)
+        console.print(" " * start + levels, soft_wrap=True)
+
+
+def _drawn_bar(bar: Bar, head: Head, console: Console) -> Text:
+    """Draw a severity: plain name, percent, bar with a mark at each level."""
+    # At most 2 % a column.
+    length = max(min(console.width - 30, 48), 8)
+    full, empty = ("█", "·") if _unicode(console) else ("#", ".")
+    value = bar.value or 0.0
+    done = round(min(value, 1.0) * length)
+    cells = [full] * done + [empty] * (length - done)
+    for level, mark in zip((head.advisory, head.limit), _marks(console), strict=True):
+        cells[min(round(level * length), length - 1)] = mark
+    known = "unknown" if bar.value is None else percent(bar.value, head.advisory, head.limit)
+    text = Text(f"  {bar.name:16}{known:>8} ")
+    text.append("".join(cells), style=STATE_STYLES.get(bar.state, ""))
+    return text
+
+
+def _marks(console: Console) -> tuple[str, str]:
+    """Marks of advisory level and limit."""
+    return ("┊", "┃") if _unicode(console) else (":", "|")
+
+
+def _unicode(console: Console) -> bool:
+    return (console.encoding or "utf-8").lower().startswith("utf")
+
+
+def _wrapped(text: str, console: Console, indent: int) -> list[str]:
+    """Break a text between words, for what is left of a line."""
+    width = max(console.width - indent, 20)
+    plain = printable(text.replace("\n", " "))
+    return textwrap.wrap(plain, width, break_long_words=False, break_on_hyphens=False) or [""]
+
+
+def print_line(console: Console, text: str) -> None:
+    """Print a line as it is: what others named is neither markup nor a terminal's command."""
+    for number, line in enumerate(_wrapped(text, console, 4)):
+        indent = "    " if number else "  "
+        console.print(f"{indent}{line}", soft_wrap=True, highlight=False, markup=False, emoji=False)
+
+
+def _severities(head: Head, result: Result, console: Console) -> Table:
+    """Numbers of the severities, grey where there is no verdict."""
+    untested = not head.drawn and result.identified
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 1), style="dim" if untested else "")
+    table.add_column("severity", no_wrap=True)
+    for name in ("estimate", "std", "95 % interval"):
+        table.add_column(name, justify="right", no_wrap=True)
+    severities = [result.severities[bar.symbol] for bar in head.bars]
+    remarks = [
+        ["no verdict"] if untested else [FLAG_REMARKS[flag] for flag in item.flags]
+        for item in severities
+    ]
+    if any(remarks):
+        table.add_column("", no_wrap=True)
+    for bar, item, remark in zip(head.bars, severities, remarks, strict=True):
+        low, high = item.interval
+        table.add_row(
+            f"{bar.name} ({bar.symbol})" if console.width >= NAMED_COLUMNS else bar.symbol,
+            _number(item.estimate, 5),
+            _number(item.std, 5),
+            f"{low:.5f} … {high:.5f}",
+            *([", ".join(remark)] if any(remarks) else []),
+        )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "nan" if value is None else f"{value:.{digits}f}"
+
+
+def _limited(result: Result) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    table.add_column("effect", no_wrap=True)
+    for name in ("estimate", "std", "95 % interval", "limit"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for item in result.other:
+        std = item.shown(_known(item.std))
+        numbers = (_known(item.value), *(item.interval95 or (math.nan, math.nan)))
+        value, low, high = to_precision(std, *map(item.shown, numbers))
+        table.add_row(
+            item.meaning,
+            f"{value} {item.shown_unit}",
+            *to_precision(std, std),
+            f"{low} … {high}",
+            f"{item.shown(_known(item.limit)):.3g} {item.shown_unit}",
+            "beyond its limit" if item.beyond else "",
+        )
+    return table
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _is_shown(item: Effect) -> bool:
+    """Whether an effect is told unasked: no offset, which the fit has, nor what was learned."""
+    from ehadiag.model.registry import SENSOR_OFFSETS  # noqa: PLC0415 - loads kernels
+
+    offsets = {offset.name for offset in SENSOR_OFFSETS}
+    return item.significant and item.name not in offsets and item.source != "calibration"
+
+
+def _size(item: Effect) -> str:
+    value, std = item.shown(_known(item.value)), item.shown(_known(item.std))
+    return f"{item.meaning} {' ± '.join(to_precision(std, value, std))} {item.shown_unit}"
+
+
+def _on_board(found: Onboard, result: Result, relied_on: bool) -> str:
+    """What the flight-control computer found, beside what was found here."""
+    parts = [f"on board: {(found.verdict or 'no verdict').replace('_', ' ')}"]
+    parts += [
+        f"{name} {_known(item.estimate):.7f}" + f" ± {_known(item.std):.7f}" * relied_on
+        for name, item in found.faults.items()
+    ]
+    if found.evaluations is not None:
+        parts.append(f"{found.evaluations} model runs")
+    apart = [
+        abs(item.estimate - own.value) / item.std
+        for name, item in found.faults.items()
+        if item.estimate is not None and item.std
+        if (own := result.severities.get(name)) is not None and own.estimate is not None
+    ]
+    if apart and relied_on:
+        parts.append(f"at most {max(apart):.2f} of its deviations from what was found here")
+    return ", ".join(parts)
+
+
+def _quality_text(result: Result) -> str:
+    item = result.quality
+    if item is None:
+        return "no frames"
+    return (
+        f"frames {item.frames}, lost {item.lost}, repeated {item.repeated}, "
+        f"conflicts {item.conflicts}, CRC errors {item.crc_errors}"
+    )
+
+
+def _effort_text(result: Result) -> str:
+    fit, timing, search = result.fit, result.timing_s, result.search
+    assert fit is not None
+    assert timing is not None
+    took = f"{timing.total - timing.read:.2f} s"
+    if timing.after_test is not None:
+        took = f"{timing.after_test:.2f} s after the test"
+    begun = f"; begun from {search.begun_from}" if search.begun_from else ""
+    return (
+        f"residual rms spool {_known(fit.spool_rms):.2f}, pressure {_known(fit.pressure_rms):.2f} "
+        f"of the noise, {_known(fit.outliers):.2%} outliers; solver {search.name}, "
+        f"seed {search.seed}, {search.evaluations} model runs, {took}{begun}"
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table
 
 from ehadiag.model.severities import FAULT_LAWS
-from ehadiag.report.head import LEAST_CHANCE, chance_text
 from firmware_iface.errors import printable
 
 if TYPE_CHECKING:
@@ -25,6 +24,10 @@ SHORT_NAMES = {name: law.short for name, law in FAULT_LAWS.items()}
 AT_LIMIT = "at its limit"
 FIGURES = 2
 """Figures of a time that is printed, 1: an interval of 80 % carries no more."""
+LEAST_CHANCE = 0.01
+"""Chance, 1, that is worth a word and a number."""
+WIDE_RANGE = 10.0
+"""Ratio of the ends of an interval, 1, beyond which no time is given, only the earliest one."""
 
 
 def print_prognosis(
@@ -272,3 +275,55 @@ def _wear_text(item: Forecast) -> str:
         return "-"
     lives = f"{item.fleet} other li{'fe' if item.fleet == 1 else 'ves'}"
     return f"mostly {item.process}, {item.diagnoses} diagnoses, {lives}"
+
+
+def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = None) -> list[str]:
+    """Return when severities reach the limit, the soonest first; only those with a number.
+
+    prognosis: what the history says; names: of the severities; None: all. Returns sentences; one
+    whose interval is wide says only the earliest time.
+    """
+    found = []
+    for item in prognosis.forecasts:
+        left = item.remaining[-1]
+        if names is not None and item.name not in names:
+            continue
+        if left.median is None or left.low is None or left.high is None or left.reached:
+            continue
+        unit = "h" if prognosis.unit == "hours" else prognosis.unit
+        low, high = two_digits(max(left.low, 0.0)), two_digits(left.high)
+        when = f"reaches its limit in about {two_digits(left.median)} {unit}"
+        when += f" (80 %: {low} to {high} {unit})"
+        if left.low > 0.0 and left.high > WIDE_RANGE * left.low:
+            when = f"reaches its limit not before about {low} {unit}"
+        past = left.chance_within(0.0) or 0.0
+        if left.median <= 0.0:
+            when = f"may have reached its limit: {chance_text(past)}"
+        elif left.low <= 0.0:
+            when += f"; it may be past it: {chance_text(past)}"
+        text = f"{SHORT_NAMES[item.name]} {when}{_counted(prognosis)}."
+        found.append((left.median, text[0].upper() + text[1:]))
+    return [text for _, text in sorted(found)]
+
+
+def _counted(prognosis: Prognosis) -> str:
+    """Say from when on times left are counted, where that is not the day of the last test."""
+    last = (prognosis.last_test or prognosis.now)[:10]
+    if last == prognosis.now[:10]:
+        return ""
+    if prognosis.usage_now is None:
+        return f", from the test of {last}"
+    unit = "h" if prognosis.unit == "hours" else prognosis.unit
+    return "" if unit == "days" else f", from now at about {two_digits(prognosis.usage_now)} {unit}"
+
+
+def two_digits(value: float) -> str:
+    """Write a number with two digits that count."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def chance_text(chance: float) -> str:
+    """Write a chance in percent; none is promised or ruled out."""
+    if not LEAST_CHANCE <= chance <= 1.0 - LEAST_CHANCE:
+        return "below 1 %" if chance < LEAST_CHANCE else "above 99 %"
+    return f"{100.0 * chance:.0f} %"

@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
-from ehadiag.assess.verdict import Levels
 from ehadiag.calibration.unit_models import Calibrated
 from ehadiag.core.actuator import Actuator
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, build_experiment
@@ -294,8 +293,7 @@ def result_picture(result: Result) -> Picture:
 
 
 def _title(result: Result, columns: int) -> list[str]:
-    request = result.request
-    head = head_of(result, Levels(request.advisory, request.limit))
+    head = head_of(result)
     lines = [head.title]
     for text in head.lines:
         lines += textwrap.wrap(printable(text), 110 * columns)

@@ -8,12 +8,13 @@ from datetime import datetime
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.core.conversion import Conversion
 from ehadiag.history.records import Entry, MaintenanceEvent, continued_usage
-from ehadiag.report.head import advised, kept_advice, percent, plain_name, remaining_sentences
+from ehadiag.report.head import advised, percent, plain_name
 from ehadiag.report.picture import (
     Area,
     Curve,
@@ -22,7 +23,8 @@ from ehadiag.report.picture import (
     PictureColumn,
     ReferenceLine,
 )
-from firmware_iface.errors import printable
+from ehadiag.report.prognosis_tables import remaining_sentences
+from firmware_iface.errors import EhadiagError, printable
 from firmware_iface.recording import CommandMode, Samples
 
 if TYPE_CHECKING:
@@ -191,3 +193,18 @@ def bus_picture(samples: Samples, conversion: Conversion, title: str) -> Picture
             Panel(channel.name, channel.unit, samples.time, tuple(curves), full_scale=full_scale)
         )
     return Picture(printable(title), (PictureColumn("", tuple(panels), "time, s"),))
+
+
+def kept_advice(line: str) -> dict[str, str]:
+    """Return what to do about each severity by its name.
+
+    line: JSON result that a history keeps; without one, as of a row that was imported, the advice
+    is that of any actuator.
+    """
+    from ehadiag.core.actuator import Advice  # noqa: PLC0415 - not for help texts
+    from ehadiag.result import Result  # noqa: PLC0415
+
+    try:
+        return {item.name: item.advice for item in Result.from_json(line).severities.values()}
+    except (EhadiagError, ValueError):
+        return msgspec.structs.asdict(Advice())

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from msgspec import structs
 
 from ehadiag.assess.verdict import Levels, Verdict
-from ehadiag.core.conventions import MAX_RESULT_BYTES
+from ehadiag.core.conventions import MAX_RESULT_BYTES, shown_date
 from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, MaintenanceEvent, counted_entries, of_unit
 from ehadiag.history.store import History
@@ -25,15 +25,18 @@ from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
 from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table, levels_text
 from ehadiag.report.head import (
     full_name,
-    kept_advice,
     percent,
     plain_name,
-    shown_date,
     verdict_word,
 )
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
-from ehadiag.report.trend_bus_pictures import first_to_the_limit, has_trend, trend_column
+from ehadiag.report.trend_bus_pictures import (
+    first_to_the_limit,
+    has_trend,
+    kept_advice,
+    trend_column,
+)
 from ehadiag.result import Result
 from ehadiag.serve.server import Page
 from firmware_iface import FREE_MOTION

@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any, Self
 import msgspec
 from msgspec.structs import replace
 
-from ehadiag.assess.verdict import Levels
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import utc_text
-from ehadiag.estimate import Severity, finite
+from ehadiag.core.conventions import finite, utc_text
+from ehadiag.estimate import Severity
 from ehadiag.live import (
     BusState,
     BusTraffic,
@@ -32,8 +31,8 @@ from ehadiag.live import (
     Snapshot,
     publish,
 )
-from ehadiag.report.head import head_of
-from ehadiag.setup import Deadline, Setup, log_of
+from ehadiag.records import log_of
+from ehadiag.setup import Deadline, Setup
 from firmware_iface.bus_map import BusMap
 from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name
 from firmware_iface.files import unused_path
@@ -232,7 +231,9 @@ class BitView:
         result = self._result
         if result is None:
             return None
-        head = head_of(result, Levels(result.request.advisory, result.request.limit))
+        from ehadiag.report.head import head_of  # noqa: PLC0415 - loads what prints
+
+        head = head_of(result)
         return Ending(verdict=head.word, reasons=head.lines)
 
     def _serial(self) -> int | None:

@@ -502,8 +502,8 @@ def _check_frames(
     actuator; tests: tests that may have been played; source: where the frames are from, for people.
     Returns the report; with a complete test the diagnosis decides on its problems.
     """
+    from ehadiag.assess.acceptance import objections_to_units  # noqa: PLC0415 - only where frames came
     from ehadiag.assess.diagnosis import diagnose  # noqa: PLC0415 - loads kernels
-    from ehadiag.assess.plausibility import objections_to_units  # noqa: PLC0415 - only where frames came
     from ehadiag.assess.verdict import Verdict  # noqa: PLC0415
     from firmware_iface.alignment.align import windowed_recordings  # noqa: PLC0415
     from firmware_iface.bus_report import report_bus  # noqa: PLC0415

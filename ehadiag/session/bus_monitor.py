@@ -14,8 +14,9 @@ import msgspec
 
 from ehadiag.assess.acceptance import objections_to_environment
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import finite
 from ehadiag.core.conversion import stated_channels
-from ehadiag.estimate import Severity, finite
+from ehadiag.estimate import Severity
 from ehadiag.live import Residuals, RunningTest, SignalTrace
 from ehadiag.monitor.change_test import LEAST, Cause, ChangeTest
 from ehadiag.monitor.plan import default_noise

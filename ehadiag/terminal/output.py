@@ -1,4 +1,7 @@
-"""Output of a call: results to standard output, all else to standard error, and the exit code."""
+"""Output of a call: results to standard output, all else to standard error, and the exit code.
+
+The summary of a call with many recordings too.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,11 @@ import json
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TextIO, cast
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from firmware_iface.errors import (
     ConfigurationError,
@@ -26,7 +31,7 @@ from firmware_iface.errors import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ehadiag.result import ListedTest
+    from ehadiag.result import ListedTest, Result
     from firmware_iface.transport.base import Transport
 
 INPUT_OUTPUT_EXIT_CODE = InputOutputError.exit_code
@@ -125,13 +130,12 @@ class _EncodedText(io.StringIO):
     encoding = "utf-8"
 
 
-def render_for_terminal(draw: Callable[[Console], None], *, least: int = 0) -> str:
-    """Return what is drawn on a console like standard output's, for `write_output`.
+def terminal_console(*, least: int = 0) -> Console:
+    """Return a console like standard output's, of which `write_drawn` writes what is drawn on it.
 
-    Not written by the console itself, which ends the program where a pipe is closed.
+    It does not write by itself: that would end the program where a pipe is closed.
 
-    draw: prints to the console that it is given; least: columns also on a narrower terminal.
-    Returns the text, with its end of line.
+    least: columns also on a narrower terminal.
     """
     from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
 
@@ -142,17 +146,19 @@ def render_for_terminal(draw: Callable[[Console], None], *, least: int = 0) -> s
     out = _EncodedText()
     out.encoding = sys.stdout.encoding or "utf-8"
     # Names of others are no markup.
-    draw(
-        Console(
-            file=out,
-            force_terminal=there.is_terminal,
-            highlight=False,
-            markup=False,
-            emoji=False,
-            width=width,
-        )
+    return Console(
+        file=out,
+        force_terminal=there.is_terminal,
+        highlight=False,
+        markup=False,
+        emoji=False,
+        width=width,
     )
-    return out.getvalue()
+
+
+def write_drawn(console: Console) -> None:
+    """Write to standard output what was drawn on a `terminal_console`."""
+    write_output(cast("_EncodedText", console.file).getvalue())
 
 
 class _ProgressLines:
@@ -284,4 +290,133 @@ def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) 
         shown = (*astuple(test)[:-1], "; ".join(test.remarks))
         table.add_row(*("-" if cell in (None, "") else printable(str(cell)) for cell in shown))
     print_text(source)
-    write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
+    console = terminal_console()
+    console.print(table, crop=False)
+    write_drawn(console)
+
+
+SUMMARY_SCHEMA = "ehadiag.summary/1"
+MAX_FAILURES_NAMED = 100
+"""Failures that are kept with their reasons."""
+MAX_WORST_UNITS = 10
+
+
+class BatchSummary:
+    """Takes each result, and keeps what is told at the end; of a size that does not grow."""
+
+    def __init__(self, inputs: int) -> None:
+        self._inputs = inputs
+        self._begin = time.perf_counter()
+        self._verdicts: Counter[str] = Counter()
+        self._failures: list[dict[str, str]] = []
+        self._failed = 0
+        self._not_tested: list[dict[str, Any]] = []
+        self._worst: dict[object, dict[str, Any]] = {}
+        self.reused = 0
+        """Results that an earlier call had found."""
+        self.left = 0
+        """Recordings that were not come to."""
+        self.codes: set[int] = set()
+        """Exit codes that came."""
+
+    def take(self, result: Result) -> None:
+        """Count a result."""
+        if result.error is not None:
+            self._failed += 1
+            if len(self._failures) < MAX_FAILURES_NAMED:
+                error = {"source": result.source, "error": result.error.text}
+                self._failures.append(error)
+            return
+        verdict = result.state or "NOT_TESTED"
+        self._verdicts[verdict] += 1
+        if verdict == "NOT_TESTED":
+            if len(self._not_tested) < MAX_FAILURES_NAMED:
+                reasons = {"source": result.source, "reasons": list(result.reasons)}
+                self._not_tested.append(reasons)
+            return
+        self._rank(result, verdict)
+
+    def _rank(self, result: Result, verdict: str) -> None:
+        """Keep it if it is among the worst units; of one unit the worst result."""
+        found = [
+            (item.estimate, item)
+            for item in result.severities.values()
+            if item.estimate is not None
+        ]
+        if not found:
+            return
+        severity, worst = max(found, key=itemgetter(0))
+        unit = result.source if result.serial is None else ("serial", result.serial)
+        before = self._worst.get(unit)
+        if before is None or before["estimate"] < severity:
+            self._worst[unit] = {
+                "serial": result.serial,
+                "source": result.source,
+                "verdict": verdict,
+                "fault": worst.name,
+                "estimate": worst.estimate,
+                "interval95": worst.interval95,
+            }
+        if len(self._worst) > MAX_WORST_UNITS:
+            del self._worst[min(self._worst, key=lambda key: self._worst[key]["estimate"])]
+
+    def tree(self, exit_code: int, workers: int) -> dict[str, Any]:
+        """Return the object `ehadiag.summary/1`."""
+        from msgspec import to_builtins  # noqa: PLC0415 - not for help texts
+
+        from ehadiag.records import package  # noqa: PLC0415 - the same
+
+        elapsed = time.perf_counter() - self._begin
+        done = sum(self._verdicts.values()) + self._failed - self.reused
+        names = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
+        worst = sorted(self._worst.values(), key=lambda item: -item["estimate"])
+        return {
+            "schema": SUMMARY_SCHEMA,
+            "inputs": self._inputs,
+            "verdicts": {name: self._verdicts[name] for name in names},
+            "failed": self._failed,
+            "reused": self.reused,
+            "not_diagnosed": self.left,
+            "worst": worst,
+            "failures": self._failures,
+            "not_tested": self._not_tested,
+            "workers": workers,
+            "elapsed_s": round(elapsed, 3),
+            "rate_per_s": round(done / elapsed, 3) if elapsed > 0 else None,
+            "exit_code": exit_code,
+            "package": to_builtins(package()),
+        }
+
+
+def summary_lines(tree: dict[str, Any]) -> list[str]:
+    """Return the summary for people."""
+    verdicts = ", ".join(
+        f"{count} {name.replace('_', ' ')}" for name, count in tree["verdicts"].items() if count
+    )
+    failed = f", {tree['failed']} not readable" if tree["failed"] else ""
+    reused = f", {tree['reused']} of them from an earlier call" if tree["reused"] else ""
+    lines = [
+        f"{tree['inputs']} recordings in {tree['elapsed_s']:.1f} s ({tree['rate_per_s']:.1f}/s): "
+        f"{verdicts or 'none diagnosed'}{failed}{reused}"
+    ]
+    if tree["not_diagnosed"]:
+        lines.append(f"not diagnosed: {tree['not_diagnosed']}")
+    counts = tree["verdicts"]
+    worst = [item for item in tree["worst"] if item["verdict"] in ("FAULT", "DEGRADED")]
+    for item in worst:
+        unit = "" if item["serial"] is None else f"serial {item['serial']}: "
+        lines.append(
+            f"{item['verdict']} {unit}{item['fault']} {item['estimate']:.3f}  {item['source']}"
+        )
+    lines += _more(counts["FAULT"] + counts["DEGRADED"] - len(worst), "FAULT or DEGRADED")
+    lines += [f"NOT TESTED {item['source']}: {'; '.join(item['reasons'])}"
+              for item in tree["not_tested"][:MAX_WORST_UNITS]]  # fmt: skip
+    lines += _more(counts["NOT_TESTED"] - MAX_WORST_UNITS, "NOT TESTED")
+    lines += [f"not readable: {item['error']}" for item in tree["failures"][:MAX_WORST_UNITS]]
+    lines += _more(tree["failed"] - MAX_WORST_UNITS, "not readable")
+    return [printable(line) for line in lines]
+
+
+def _more(count: int, what: str) -> list[str]:
+    """Line on those that are not listed."""
+    return [f"and {count} more {what}"] if count > 0 else []

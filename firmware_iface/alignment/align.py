@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import numpy as np
 from msgspec.structs import replace
 
-from firmware_iface.alignment.episodes import Episode, find_episodes
+from firmware_iface.alignment.episodes import Episode, find_episodes, read_status, resolve_turns
 from firmware_iface.alignment.frame_faults import (
     Conflicts,
     count_frames,
@@ -28,11 +28,11 @@ from firmware_iface.alignment.grid import (
     command_modes,
     samples_of,
 )
-from firmware_iface.alignment.status import onboard_results, read_status, resolve_turns
 from firmware_iface.alignment.ticks import TickAxis, place_frames
 from firmware_iface.bus_map import BusMap
 from firmware_iface.codec import DecodedTable, channels_in, choose_channel, decode
 from firmware_iface.find_test import CandidateTests, extract_tests, rows_of_samples
+from firmware_iface.live_decode import OnboardReader
 from firmware_iface.protection import rows_of
 from firmware_iface.recording import (
     ACTIVE_BIT_STATES,
@@ -88,15 +88,13 @@ def assemble(
         notes += ("no telemetry in the recording",)
     else:
         notes += axis.notes
-    episodes = find_episodes(decoded, axis, status, bus_map, no_status_is_test=no_status_is_test)
+    episodes = find_episodes(decoded, axis, status, no_status_is_test=no_status_is_test)
     bounds = RowBounds.of(axis) if axis is not None else None
-    looked_for = (
-        candidates if axis is not None and not _has_test_timing(decoded, axis, bus_map) else None
-    )
+    looked_for = candidates if axis is not None and not _has_test_timing(decoded, axis) else None
     # Ticks around a test, as the status has it, in which its command is looked for.
     margin = 100 if looked_for is not None else 0
     found: list[Recording] = []
-    own = onboard_results(table, bus_map)
+    own = onboard_results(table, decoded.onboard, bus_map)
     for item, after in zip(episodes, (*episodes[1:], None), strict=True):
 
         def cut(mode: CommandMode | None, item: Episode = item) -> Recording:
@@ -153,13 +151,15 @@ def _in_each_mode(
     return named or found[:1]
 
 
-def _has_test_timing(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> bool:
+def _has_test_timing(decoded: DecodedTable, axis: TickAxis) -> bool:
     """Whether commands carry the test's number, or counters tell to which tick a status belongs."""
-    command = bus_map.find("command.test_id")
-    if command is not None and len(decoded.messages[command[0].name].row):
+    command, status = (
+        decoded.messages.get(decoded.message_of.get(role, ""))
+        for role in ("command.test_id", "status.test_id")
+    )
+    if command is not None and len(command.row):
         return True
-    status = bus_map.find("status.test_id")
-    return bool(axis.turn) and status is not None and len(decoded.messages[status[0].name].row) > 0
+    return bool(axis.turn) and status is not None and len(status.row) > 0
 
 
 def _matched_in(
@@ -256,8 +256,8 @@ def _recording(
         outcome=episode.outcome,
         environment=replace(
             environment,
-            temperature_std=_rounding_std(bus_map, "oil_temperature"),
-            supply_std=_rounding_std(bus_map, "supply_pressure", "return_pressure"),
+            temperature_std=_rounding_std(decoded, "oil_temperature"),
+            supply_std=_rounding_std(decoded, "supply_pressure", "return_pressure"),
         ),
         quality=quality,
         channel=bus_map.channel,
@@ -331,14 +331,19 @@ def _environment(
     return Environment(**medians), tuple(reasons)
 
 
-def _rounding_std(bus_map: BusMap, *quantities: str) -> float:
+def _rounding_std(decoded: DecodedTable, *quantities: str) -> float:
     """Standard deviation of the sum of quantities of the environment by their steps on the bus.
 
     SI, or K; each is off evenly by half a step at most.
     """
-    found = (bus_map.find(f"environment.{name}") for name in quantities)
-    roles = [item[1] for item in found if item is not None and not item[1].signal.is_float]
-    return math.hypot(*(role.signal.scale * role.gain for role in roles)) / math.sqrt(12.0)
+    wanted = {f"environment.{name}" for name in quantities}
+    roles = (role for item in decoded.messages.values() for role in item.message.roles)
+    steps = (
+        role.signal.scale * role.gain
+        for role in roles
+        if role.name in wanted and not role.signal.is_float
+    )
+    return math.hypot(*steps) / math.sqrt(12.0)
 
 
 MIN_WINDOW_FRAMES = 200_000
@@ -467,3 +472,25 @@ class _WindowReader:
             measured = (item for item in self._map.messages.values() if item.measures)
             rows += [rows_of(window, item) for item in measured]
         return np.sort(np.concatenate(rows)) if rows else np.empty(0, dtype=np.int64)
+
+
+def onboard_results(
+    table: FrameTable, rows: IntArray, bus_map: BusMap
+) -> list[tuple[int, OnboardResult]]:
+    """Find all results of the computer in a frame table.
+
+    table: frames in order of arrival; rows: of those that it may consist of; bus_map: what they
+    mean. Returns the row at which each was whole, ascending, and the result.
+    """
+    if not len(rows):
+        return []
+    reader, found = OnboardReader(bus_map), []
+    before = None
+    for row in rows.tolist():
+        payload = table.data[row, : table.length[row]].tobytes()
+        reader.take_payload(int(table.can_id[row]), bool(table.extended[row]), payload)
+        if reader.result is not before:
+            before = reader.result
+            if before is not None:
+                found.append((row, before))
+    return found

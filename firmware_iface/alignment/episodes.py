@@ -1,4 +1,4 @@
-"""Finds the tests in a recording: where each begins, how long it is and how it ended."""
+"""Finds the tests in a recording by commands and status: where each begins, and how it ended."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from firmware_iface.alignment.status import StatusTable
 from firmware_iface.alignment.ticks import TickAxis
 from firmware_iface.bus_map import BusMap
-from firmware_iface.codec import DecodedTable
+from firmware_iface.codec import Decoded, DecodedTable
 from firmware_iface.protection import NO_POSITION
-from firmware_iface.recording import MAX_GRID_TICKS, BitOutcome, BitReason, BitState, IntArray
+from firmware_iface.recording import (
+    MAX_GRID_TICKS,
+    BitOutcome,
+    BitReason,
+    BitState,
+    FloatArray,
+    IntArray,
+)
 
 MIN_REPEATS = 2
 """Times a value must be told to count: a damaged frame whose check sum fits tells it once."""
@@ -53,7 +59,6 @@ def find_episodes(
     decoded: DecodedTable,
     axis: TickAxis | None,
     status: StatusTable,
-    bus_map: BusMap,
     *,
     no_status_is_test: bool = True,
 ) -> tuple[Episode, ...]:
@@ -66,9 +71,9 @@ def find_episodes(
     running, second = main_time_base(status, running)
     spans: list[_Span] = []
     if axis is not None:
-        spans = _spans_by_id(decoded, axis, bus_map)
+        spans = _spans_by_id(decoded, axis)
         spans = _merge(spans, _spans_by_status(status, running, axis))
-        if not spans and no_status_is_test and _lacks_test_messages(decoded, status, bus_map):
+        if not spans and no_status_is_test and _lacks_test_messages(decoded, status):
             spans = [_Span(int(axis.tick.min()), int(axis.tick.max()) + 1, None)]
     found = []
     for index, span in enumerate(spans):
@@ -79,19 +84,19 @@ def find_episodes(
     return tuple(sorted(found, key=lambda item: item.first)) if found else (_never_ran(status),)
 
 
-def _lacks_test_messages(decoded: DecodedTable, status: StatusTable, bus_map: BusMap) -> bool:
+def _lacks_test_messages(decoded: DecodedTable, status: StatusTable) -> bool:
     """Whether neither commands nor status could have told of a test."""
-    command = bus_map.find("command.test_id")
-    commands = command is not None and len(decoded.messages[command[0].name].row) > 0
+    command = decoded.messages.get(decoded.message_of.get("command.test_id", ""))
+    commands = command is not None and len(command.row) > 0
     return not commands and len(status.row) == 0
 
 
-def _spans_by_id(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> list[_Span]:
-    found = bus_map.find("command.test_id")
-    if found is None or found[0].name not in axis.ticks:
+def _spans_by_id(decoded: DecodedTable, axis: TickAxis) -> list[_Span]:
+    name = decoded.message_of.get("command.test_id")
+    if name is None or name not in axis.ticks:
         return []
-    item = decoded.messages[found[0].name]
-    tick, value = axis.ticks[found[0].name], item.values["command.test_id"]
+    item = decoded.messages[name]
+    tick, value = axis.ticks[name], item.values["command.test_id"]
     known = np.isfinite(value) & (tick > NO_POSITION // 2)
     order = np.argsort(tick[known], kind="stable")
     tick, ids = tick[known][order], value[known][order].astype(np.int64)
@@ -421,3 +426,115 @@ def _one_value(what: str, values: IntArray, expected: int | None, ends: bool) ->
         other = int(unique[unique != usual][0])
         return "", f"one status frame says {what} {other}, all others {usual}"
     return "", ""
+
+
+MAX_HOLE_TICKS = 3
+"""Ticks without a frame up to which the next frame still tells the present tick."""
+
+
+class StatusTable(msgspec.Struct, frozen=True, eq=False):
+    """Status frames as columns, shape (n,); NaN or -1 where the bus does not say."""
+
+    row: IntArray
+    """Row of the frame table."""
+    state: IntArray
+    """BitState, -1 unknown."""
+    reason: IntArray
+    """Numbers, -1 unknown."""
+    test_id: IntArray
+    serial: IntArray
+    elapsed: FloatArray
+    """Ticks, NaN unknown."""
+    following: IntArray
+    """Tick of the next telemetry or command frame."""
+
+    @property
+    def start(self) -> FloatArray:
+        """First tick of the test that each frame implies."""
+        return self.following - self.elapsed
+
+
+def read_status(decoded: DecodedTable, axis: TickAxis | None, bus_map: BusMap) -> StatusTable:
+    """Collect the status frames; the message that carries the state leads."""
+    of = decoded.message_of
+    lead = of.get("status.state") or of.get("status.elapsed", "")
+    return _status_of(decoded.messages.get(lead), axis, bus_map)
+
+
+def _status_of(item: Decoded | None, axis: TickAxis | None, bus_map: BusMap) -> StatusTable:
+    count = 0 if item is None else len(item.row)
+
+    def column(key: str) -> FloatArray:
+        if item is None or f"status.{key}" not in item.values:
+            return np.full(count, np.nan)
+        return item.values[f"status.{key}"]
+
+    def numbers(key: str) -> IntArray:
+        return np.nan_to_num(column(key), nan=-1.0).astype(np.int64)
+
+    raw = numbers("state")
+    state = np.full(count, -1, dtype=np.int64)
+    for number, meaning in bus_map.states.items():
+        state[raw == number] = int(meaning)
+    row = np.empty(0, dtype=np.int64) if item is None else item.row
+    following = np.zeros(count, dtype=np.int64)
+    if axis is not None and item is not None:
+        following = _next_tick(axis, item, bus_map.tick_ns)
+    return StatusTable(
+        row=row,
+        state=state,
+        reason=numbers("reason"),
+        test_id=numbers("test_id"),
+        serial=numbers("serial"),
+        elapsed=np.rint(column("elapsed") * 1e9 / bus_map.tick_ns),
+        following=following,
+    )
+
+
+def _next_tick(axis: TickAxis, item: Decoded, tick_ns: int) -> IntArray:
+    """Tick that begins after each status frame; by time where the frames around it are missing."""
+    fraction, following = axis.at(item.row, item.time_ns, tick_ns)
+    after = np.searchsorted(axis.row, item.row)
+    before = np.maximum(after - 1, 0)
+    hole = np.abs(following - axis.tick[before]) > MAX_HOLE_TICKS
+    wait = axis.time_ns[np.minimum(after, len(axis.row) - 1)] - item.time_ns
+    by_time = np.ceil(fraction).astype(np.int64)
+    return np.where(
+        hole & (after > 0) & (np.abs(wait) > MAX_HOLE_TICKS * tick_ns), by_time, following
+    )
+
+
+def resolve_turns(axis: TickAxis, status: StatusTable) -> TickAxis:
+    """Take back counter turns that the elapsed time of a running test contradicts.
+
+    Host time chooses the turns that a gap hides; a host clock that steps by nearly whole turns
+    looks like a gap. The computer's own elapsed time tells them apart.
+    """
+    running = np.flatnonzero((status.state == BitState.RUNNING) & np.isfinite(status.elapsed))
+    start, elapsed = status.start[running], status.elapsed[running]
+    offset = np.diff(start)
+    turns = np.rint(offset / max(axis.turn, 1))
+    wrong = (turns != 0) & (np.abs(offset - axis.turn * turns) <= MAX_HOLE_TICKS)
+    wrong &= (np.diff(elapsed) >= 0) & (np.diff(status.test_id[running]) == 0)
+    if not axis.turn or not wrong.any():
+        return axis
+    tick = axis.tick.copy()
+    shift_from: list[tuple[int, int]] = []
+    for index in np.flatnonzero(wrong):
+        low, high = np.searchsorted(axis.row, status.row[running[index : index + 2]])
+        low = max(int(low), 1)
+        if high < low:
+            continue
+        jumps = np.diff(axis.tick[low - 1 : high + 1])
+        if len(jumps):
+            place = low + int(np.argmax(np.abs(jumps)))
+            shift_from.append((int(axis.row[place]), int(turns[index]) * axis.turn))
+    ticks = dict(axis.ticks)
+    for row, shift in shift_from:
+        tick[axis.row >= row] -= shift
+        ticks = {
+            name: np.where(axis.rows[name] >= row, values - shift, values)
+            for name, values in ticks.items()
+        }
+    note = "the computer's elapsed time took back a gap that the host clock suggested"
+    return replace(axis, tick=tick, ticks=ticks, notes=(*axis.notes, note))

@@ -56,10 +56,9 @@ def drop_conflicts(
     ticks = {} if axis is None else dict(axis.ticks)
     found: dict[str, Conflicts] = {}
     for name, item in decoded.messages.items():
-        counter = item.message.counter
-        if counter is None or item.counter is None or len(item.row) < 2:
+        if item.counter is None or len(item.row) < 2:
             continue
-        counted = counter.present(item.data)
+        counted = item.counted
         if axis is not None and name in ticks:
             position = _positions(item, ticks[name], axis.every[name])
             bad = conflicting(position, item.data)
@@ -70,7 +69,7 @@ def drop_conflicts(
                 ticks[name] = np.where(bad, NO_POSITION, ticks[name])
         else:
             has, some = event_positions(
-                item.counter, item.time_ns, item.message.modulus, item.values.get("status.state")
+                item.counter, item.time_ns, item.modulus, item.values.get("status.state")
             )
             position = np.zeros(len(item.row), dtype=np.int64)
             position[has] = some
@@ -90,7 +89,7 @@ def drop_conflicts(
 def _conflicts(item: Decoded, bad: BoolArray, position: IntArray) -> Conflicts:
     if item.counter is None:
         raise AssertionError("no conflict without a counter")
-    modulus = item.message.modulus
+    modulus = item.modulus
     step = np.diff(item.counter, prepend=item.counter[:1]) % modulus
     # A reordered frame does not make so large a step.
     apart = np.minimum(step, modulus - step) > 16
@@ -105,7 +104,7 @@ def _positions(item: Decoded, tick: IntArray, every: int) -> IntArray:
     place = np.flatnonzero(sound)
     if len(place) == 0:
         return item.counter
-    modulus = item.message.modulus
+    modulus = item.modulus
     position = tick // every
     shift = position[place[0]] - item.counter[place[0]]
     before = np.maximum.accumulate(np.where(sound, np.arange(len(tick)), place[0]))
@@ -187,9 +186,9 @@ def slow_values(
         # Between two frames of a slow page the counter goes on with all the fast ones.
         counts = len(streams) == 1 or brings_slow_values(message)
         counter = item.counter if counts else None
-        if counter is not None and message.counter is not None:
-            counted = message.counter.present(data)
-            counter = counter[mine] if counted is None or counted.all() else None
+        if counter is not None:
+            every = item.counted is None or item.counted[mine].all()
+            counter = counter[mine] if every else None
         time_ns = item.time_ns[mine]
         keep = ~repeated_frames(message, time_ns, data, counted=counter is not None)
         values = {role: item.values[role][mine][keep] for role in roles}
@@ -198,6 +197,7 @@ def slow_values(
             message,
             stamps,
             None if counter is None else counter[keep],
+            item.modulus,
             values,
             max(span_ns, int(np.ptp(stamps))),
         )
@@ -240,7 +240,7 @@ def count_frames(
         expected = _expected(at, stream, episode.ticks, axis.every.get(item.message.name, 1))
         position = at * (int(stream.max(initial=0)) + 1) + stream
     elif item.counter is not None:
-        position = _sequence(item.counter[inside], item.message.modulus)
+        position = _sequence(item.counter[inside], item.modulus)
         expected = int(position.max() - position.min()) + 1 if len(position) else 0
     else:
         # Nothing tells of frames that did not come.

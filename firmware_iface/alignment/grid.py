@@ -90,11 +90,10 @@ class TickGrid(msgspec.Struct, frozen=True, eq=False):
 
         role: as in a mapping. Returns None without a frame of the role's message.
         """
-        found = self.bus_map.find(role)
-        tick = self.axis.ticks.get(found[0].name) if found is not None else None
-        if found is None or tick is None or len(tick) == 0:
+        item = self.decoded.messages.get(self.decoded.message_of.get(role, ""))
+        tick = None if item is None else self.axis.ticks.get(item.message.name)
+        if item is None or tick is None or len(tick) == 0:
             return None
-        item = self.decoded.messages[found[0].name]
         near = slice(*np.searchsorted(item.row, [self.begin, self.end]))
         at = tick[near] - self.episode.first
         value = item.values[role][near]

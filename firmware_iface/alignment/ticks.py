@@ -285,7 +285,7 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
     moving = np.concatenate([~_standing(counted[name], tick_ns) for name in names])
     # Stable sorting merges columns that are sorted already: twice as fast.
     order = np.argsort(row, kind="stable")
-    modulus = counted[names[0]].message.modulus
+    modulus = counted[names[0]].modulus
     owner, row, time_ns = owner[order], row[order], time_ns[order]
     position, notes = _unwrap(counter[order], time_ns, moving[order], tick_ns, modulus)
     sound = position != NO_POSITION
@@ -313,7 +313,7 @@ def _anchor_axis(anchor: Decoded, tick_ns: int) -> TickAxis:
         tick=tick[sound],
         time_ns=anchor.time_ns[sound],
         every={name: every},
-        turn=anchor.message.modulus * every,
+        turn=anchor.modulus * every,
         notes=notes,
     )
 
@@ -331,7 +331,7 @@ def _standing(item: Decoded, period_ns: int) -> BoolArray:
         mine = np.flatnonzero(item.stream == stream)
         waited = np.diff(item.time_ns[mine])
         still = np.diff(item.counter[mine]) == 0
-        still &= (waited > period_ns // 2) & (waited < item.message.modulus * period_ns // 2)
+        still &= (waited > period_ns // 2) & (waited < item.modulus * period_ns // 2)
         standing[mine[1:][still]] = True
     return standing
 
@@ -364,9 +364,7 @@ def _own_ticks(item: Decoded, tick_ns: int) -> tuple[IntArray, int, tuple[str, .
     every = _frame_spacing(item, tick_ns)
     if item.counter is not None and every >= 1:
         moving = ~_standing(item, every * tick_ns)
-        count, notes = _unwrap(
-            item.counter, item.time_ns, moving, every * tick_ns, item.message.modulus
-        )
+        count, notes = _unwrap(item.counter, item.time_ns, moving, every * tick_ns, item.modulus)
         begin = int(count[count != NO_POSITION][0])
         return np.where(count == NO_POSITION, NO_POSITION, (count - begin) * every), every, notes
     if every >= 1:
@@ -397,7 +395,7 @@ def _frame_spacing(item: Decoded, tick_ns: int) -> int:
         since = (item.time_ns - item.time_ns[0]) / tick_ns
         return spacing_of(since, item.message.cycle_ns / tick_ns)
     steps = np.diff(item.time_ns) / tick_ns
-    counts = np.diff(item.counter) % item.message.modulus
+    counts = np.diff(item.counter) % item.modulus
     steps = steps[counts == 1] if np.any(counts == 1) else steps
     return int(np.rint(np.median(steps))) if np.median(steps) < 1e6 else 1
 

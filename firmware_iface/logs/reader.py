@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -26,7 +26,7 @@ from firmware_iface.logs.log_files import (
     log_size,
     unpacked_log,
 )
-from firmware_iface.recording import BitState, IntArray, Recording
+from firmware_iface.recording import IntArray, Recording
 from firmware_iface.transport.frames import FrameTable, concatenate
 
 
@@ -192,10 +192,6 @@ class _StampCounts:
         return tuple(found)
 
 
-MAX_LISTED_TESTS = 3
-"""Tests passed over that are told one by one."""
-
-
 def iterate_recordings(
     path: Path | str,
     bus_map: BusMap | None = None,
@@ -236,7 +232,7 @@ def iterate_recordings(
         reader, bus_map or default_map(), str(path), budget.held, candidates=candidates
     )
     for recording in tests:
-        yield _with_notes(recording, reader.notes)
+        yield with_notes(recording, reader.notes)
 
 
 def read_recordings(
@@ -249,92 +245,11 @@ def read_recordings(
     return tuple(iterate_recordings(path, bus_map, budget, candidates))
 
 
-def read_recording(
-    path: Path | str,
-    bus_map: BusMap | None = None,
-    budget: Budget | None = None,
-    candidates: CandidateTests | None = None,
-) -> Recording:
-    """Read the last complete test of a log; the last one begun if none was completed.
-
-    Its notes say what was passed over. Where tests lie on several adapter channels and none was
-    chosen, it is refused.
-    """
-    return choose_recording(iterate_recordings(path, bus_map, budget, candidates))
-
-
-def choose_recording(recordings: Iterable[Recording]) -> Recording:
-    """Return the last complete test, or the last with samples, or the last.
-
-    Its notes name the other tests. Only the best so far is held.
-
-    Parameters
-    ----------
-    recordings : Iterable[Recording]
-        Tests of one log, in order of time.
-
-    Returns
-    -------
-    Recording
-        The chosen one, with notes on the others.
-
-    Raises
-    ------
-    ValueError
-        No recording at all.
-    """
-    best: Recording | None = None
-    place, count = 0, 0
-    others: list[str] = []
-    channels: set[int] = set()
-    for count, item in enumerate(recordings, start=1):
-        others.append(describe_recording(item, count))
-        if item.samples is not None and item.channel:
-            channels.add(item.channel)
-        if best is None or _completeness(item) >= _completeness(best):
-            best, place = item, count
-    if best is None:
-        raise ValueError("no recording to choose from")
-    del others[place - 1]
-    notes = tuple(f"passed over: {item}" for item in others[-MAX_LISTED_TESTS:])
-    if len(others) > MAX_LISTED_TESTS:
-        notes = (
-            f"{len(others) - MAX_LISTED_TESTS} earlier tests of the recording passed over",
-            *notes,
-        )
-    best = _with_notes(best, notes)
-    return _refused(best, sorted(channels)) if len(channels) > 1 else best
-
-
-def _completeness(item: Recording) -> int:
-    if item.samples is None:
-        return 0
-    return 2 if item.outcome.state is BitState.COMPLETE else 1
-
-
-def _with_notes(item: Recording, notes: tuple[str, ...]) -> Recording:
+def with_notes(item: Recording, notes: tuple[str, ...]) -> Recording:
+    """Return a recording with further notes."""
     if not notes:
         return item
     return replace(item, quality=replace(item.quality, notes=(*item.quality.notes, *notes)))
-
-
-def _refused(item: Recording, channels: Sequence[int]) -> Recording:
-    listed = ", ".join(map(str, channels))
-    why = f"tests on the adapter channels {listed}: choose the actuator's by --log-channel"
-    return replace(item, quality=replace(item.quality, refused=(*item.quality.refused, why)))
-
-
-def describe_recording(item: Recording, number: int) -> str:
-    """A test of a log in one clause: number, length, outcome, serial number, channel."""
-    state = item.outcome.state
-    how = "how it ended is not said" if state is None else state.name.lower().replace("_", " ")
-    if state is BitState.RUNNING:
-        how = "without the word of its end"
-    test = "unnamed" if item.test_id is None else str(item.test_id)
-    length = "" if item.samples is None else f", {item.duration:.3f} s"
-    serial = "" if item.serial is None else f", serial {item.serial}"
-    channel = f", channel {item.channel}" if item.channel else ""
-    return f"test {test} (no. {number} of the recording{length}{serial}{channel}): {how}"
 
 
 def read_frames(path: Path | str, budget: Budget | None = None) -> FrameTable:

@@ -9,10 +9,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from firmware_iface.bus_map import ROLE_DIMENSIONS
+from firmware_iface.bus_map import ROLE_DIMENSIONS, si_factor
 from firmware_iface.errors import ConfigurationError, printable
 from firmware_iface.files import read_toml
-from firmware_iface.mapping_file import si_factor
 
 COLUMNS_SCHEMA = "ehadiag.columns/1"
 TIME_ROLE = "time"

@@ -6,7 +6,7 @@ Decoded signals are resampled to control ticks and matched with the stored tests
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -25,12 +25,13 @@ from firmware_iface.find_test import (
     search_tests,
 )
 from firmware_iface.logs.log_files import Budget, holds_signals
-from firmware_iface.logs.reader import iterate_recordings, read_frames
+from firmware_iface.logs.reader import iterate_recordings, read_frames, with_notes
 from firmware_iface.recording import (
     CHANNELS,
     MAX_GRID_TICKS,
     Acquisition,
     BitOutcome,
+    BitState,
     CommandMode,
     Environment,
     FloatArray,
@@ -373,3 +374,92 @@ def _merged_frames(tables: Sequence[FrameTable]) -> FrameTable:
     order = np.argsort(steady, kind="stable")
     channel = np.zeros(len(order), dtype=whole.channel.dtype)
     return replace(whole.rows(order), channel=channel)
+
+
+MAX_LISTED_TESTS = 3
+"""Tests passed over that are told one by one."""
+
+
+def read_recording(
+    path: Path | str,
+    bus_map: BusMap | None = None,
+    budget: Budget | None = None,
+    candidates: CandidateTests | None = None,
+) -> Recording:
+    """Read the last complete test of a log; the last one begun if none was completed.
+
+    Its notes say what was passed over. Where tests lie on several adapter channels and none was
+    chosen, it is refused.
+    """
+    return choose_recording(iterate_recordings(path, bus_map, budget, candidates))
+
+
+def choose_recording(recordings: Iterable[Recording]) -> Recording:
+    """Return the last complete test, or the last with samples, or the last.
+
+    Its notes name the other tests. Only the best so far is held.
+
+    Parameters
+    ----------
+    recordings : Iterable[Recording]
+        Tests of one log, in order of time.
+
+    Returns
+    -------
+    Recording
+        The chosen one, with notes on the others.
+
+    Raises
+    ------
+    ValueError
+        No recording at all.
+    """
+    best: Recording | None = None
+    place = 0
+    others: dict[int, str] = {}
+    channels: set[int] = set()
+    for number, item in enumerate(recordings, start=1):
+        if item.samples is not None and item.channel:
+            channels.add(item.channel)
+        if best is not None and _completeness(item) < _completeness(best):
+            others[number] = describe_recording(item, number)
+            continue
+        if best is not None:
+            others[place] = describe_recording(best, place)
+        best, place = item, number
+    if best is None:
+        raise ValueError("no recording to choose from")
+    listed = sorted(others)[-MAX_LISTED_TESTS:]
+    notes = tuple(f"passed over: {others[number]}" for number in listed)
+    if len(others) > MAX_LISTED_TESTS:
+        notes = (
+            f"{len(others) - MAX_LISTED_TESTS} earlier tests of the recording passed over",
+            *notes,
+        )
+    best = with_notes(best, notes)
+    return _refused(best, sorted(channels)) if len(channels) > 1 else best
+
+
+def _completeness(item: Recording) -> int:
+    if item.samples is None:
+        return 0
+    return 2 if item.outcome.state is BitState.COMPLETE else 1
+
+
+def _refused(item: Recording, channels: Sequence[int]) -> Recording:
+    listed = ", ".join(map(str, channels))
+    why = f"tests on the adapter channels {listed}: choose the actuator's by --log-channel"
+    return replace(item, quality=replace(item.quality, refused=(*item.quality.refused, why)))
+
+
+def describe_recording(item: Recording, number: int) -> str:
+    """A test of a log in one clause: number, length, outcome, serial number, channel."""
+    state = item.outcome.state
+    how = "how it ended is not said" if state is None else state.name.lower().replace("_", " ")
+    if state is BitState.RUNNING:
+        how = "without the word of its end"
+    test = "unnamed" if item.test_id is None else str(item.test_id)
+    length = "" if item.samples is None else f", {item.duration:.3f} s"
+    serial = "" if item.serial is None else f", serial {item.serial}"
+    channel = f", channel {item.channel}" if item.channel else ""
+    return f"test {test} (no. {number} of the recording{length}{serial}{channel}): {how}"

@@ -13,7 +13,7 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -308,3 +308,25 @@ def _environment_options(context: str | None) -> dict[str, str]:
     except (ValueError, TypeError) as error:
         name = f"CAN_CONFIG_{context}" if context else "CAN_CONFIG"
         raise ConfigurationError(f"variable {name}: no JSON object: {one_line(error)}") from None
+
+
+def interface_options(pairs: Iterable[str]) -> dict[str, Any]:
+    """Read an adapter's own options, each KEY=VALUE, as of `--bus-kwargs`."""
+    out: dict[str, Any] = {}
+    for pair in pairs:
+        key, separator, text = pair.partition("=")
+        if not separator or not key.isidentifier():
+            raise ConfigurationError(f"--bus-kwargs {pair}: need KEY=VALUE")
+        out[key] = _interface_value(text)
+    return out
+
+
+def _interface_value(text: str) -> bool | int | float | str:
+    if text in ("True", "true", "False", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

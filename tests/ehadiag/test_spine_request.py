@@ -10,7 +10,7 @@ import pytest
 
 from ehadiag.api import Options
 from ehadiag.cli import options
-from ehadiag.cli.defaults import FILE_KEYS, PROJECT_KEYS
+from ehadiag.cli.command_parser import file_keys, project_keys
 from ehadiag.cli.main import parser_and_commands
 from ehadiag.request import Request, request_options
 from firmware_iface.errors import ConfigurationError
@@ -83,9 +83,9 @@ def test_each_field_says_what_it_is_and_what_it_takes() -> None:
 
 
 def test_a_projects_file_may_set_what_the_fields_say() -> None:
-    assert {"actuator", "log_channel", "seed", "rule"} <= PROJECT_KEYS
-    assert not {"time_limit", "max_frames", "all", "tolerance"} & PROJECT_KEYS
-    assert {"actuator", "mapping", "dbc", "test", "prior"} == FILE_KEYS
+    assert {"actuator", "log_channel", "seed", "rule"} <= project_keys()
+    assert not {"time_limit", "max_frames", "all", "tolerance"} & project_keys()
+    assert {"actuator", "mapping", "dbc", "test", "prior"} == file_keys()
 
 
 @pytest.mark.parametrize(

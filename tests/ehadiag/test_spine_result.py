@@ -35,13 +35,14 @@ from ehadiag.export.fmu import FMU_UNITS, actuator_variables, monitor_variables
 from ehadiag.history.records import Usage, history_entry
 from ehadiag.history.store import History
 from ehadiag.identify.identification_result import Nuisance
+from ehadiag.identify.prior import unit_prior
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, REGISTRY, SENSOR_OFFSETS, Unknowns, parameter
 from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.monitor.monitor_memory import MONITOR_UNIT_FIELDS
 from ehadiag.records import result_of
-from ehadiag.report.result_tables import diagnosis_text
+from ehadiag.report.head import diagnosis_text
 from ehadiag.result import Result, result_schema
 from ehadiag.session.unit_state import unit_state_from_history, unit_state_of
 from ehadiag_sim.conditions import Effects, Faults, Sensors, condition_options
@@ -63,7 +64,7 @@ def everything(result: Result) -> Result:
     """The same as if every parameter of the registry had been estimated."""
     from msgspec.structs import replace
 
-    from ehadiag.assess.other_causes import effects_of
+    from ehadiag.assess.other_causes import effects_of, with_limits
 
     found = result.diagnosis.identification
     assert found is not None
@@ -71,8 +72,16 @@ def everything(result: Result) -> Result:
         item.name: Nuisance(0.3 * item.scale, 0.01 * item.scale, at_bound=False) for item in EFFECTS
     }
     found = replace(found, nuisances=nuisances)
-    effects = effects_of(found, result.diagnosis.actuator)
-    return result_of(replace(result.diagnosis, identification=found, effects=effects))
+    actuator = result.diagnosis.actuator
+    effects = effects_of(found, unit_prior(actuator), actuator)
+    return result_of(
+        replace(
+            result.diagnosis,
+            identification=found,
+            effects=effects,
+            other=with_limits(effects, actuator),
+        )
+    )
 
 
 def keys_of(tree: Any, at: str = "") -> set[str]:

@@ -10,8 +10,8 @@ from ehadiag.identify.experiment import build_experiment
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
 from ehadiag_tools.simulator.units import damaged_unit
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS, Environment
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 PAPER_FAULTS = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))

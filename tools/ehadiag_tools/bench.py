@@ -50,8 +50,9 @@ from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import decode
 from firmware_iface.errors import InputOutputError
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import Recording, Samples
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 from firmware_iface.transport.frames import FrameTable
 

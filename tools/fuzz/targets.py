@@ -42,12 +42,12 @@ from firmware_iface.live_decode import (
 )
 from firmware_iface.logs.blf import CONTAINER_HEADER, FILE_HEADER, OBJECT_HEADER
 from firmware_iface.logs.log_files import Budget
-from firmware_iface.logs.reader import choose_recording, read_frames, read_recordings
+from firmware_iface.logs.reader import read_frames, read_recordings
 from firmware_iface.mapping_file import MappingFile
 from firmware_iface.protection import crc8, intact
 from firmware_iface.recording import CommandMode
 from firmware_iface.signals.columns import load_columns
-from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.signals.recordings import Interpretation, choose_recording, recorded_tests
 from firmware_iface.stored_test import bundled_tests, load_test
 from firmware_iface.transport.frames import MAX_PAYLOAD, Frame, FrameTable
 from firmware_iface.transport.serial_link import MAX_CODED_BYTES, Framer, packet_of

@@ -11,12 +11,11 @@ from ehadiag import default_actuator
 from ehadiag.assess.blocks import (
     BLOCKS,
     block_masks,
-    creep_note,
     pulls_of_blocks,
-    spool_steps,
     unexplained_block,
     words_of_pulls,
 )
+from ehadiag.assess.response_checks import creep_note, spool_steps
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import parameter
 from ehadiag.model.residual_models import ModelResponse

@@ -31,7 +31,7 @@ from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.identification_session import identify
 from firmware_iface.find_test import CandidateTests, extract_tests
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 ACTUATOR, TEST = default_actuator(), resolve_test("closed")

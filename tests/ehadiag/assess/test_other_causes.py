@@ -16,7 +16,6 @@ from places import LOGS
 import ehadiag
 from ehadiag import Actuator, ConfigurationError, Verdict, bundled_tests, default_actuator
 from ehadiag.assess import diagnosis
-from ehadiag.assess.acceptance import objections_to_estimate
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.other_causes import (
     chance_beyond,
@@ -26,15 +25,17 @@ from ehadiag.assess.other_causes import (
     notes_on_effects,
 )
 from ehadiag.assess.response_checks import identified_response, objections_to_supply
+from ehadiag.assess.verdict import objections_to_estimate
 from ehadiag.core.actuator import actuator_toml
 from ehadiag.identify.identification_result import Fit, Nuisance
+from ehadiag.identify.prior import unit_prior
 from ehadiag.records import result_of
 from ehadiag.report.response_signals import result_picture
 from ehadiag_sim.broken_hardware import simulate_broken
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
 from firmware_iface.files import decode_toml
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 NOISE = Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0, 0.003, 1.0)
@@ -42,7 +43,8 @@ NOISE = Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0, 0.003, 1.0)
 
 def found(fit=NOISE, **values):
     nuisances = {name: Nuisance(*pair, at_bound=False) for name, pair in values.items()}
-    return effects_of(SimpleNamespace(nuisances=nuisances, fit=fit), default_actuator())
+    actuator = default_actuator()
+    return effects_of(SimpleNamespace(nuisances=nuisances, fit=fit), unit_prior(actuator), actuator)
 
 
 @pytest.mark.parametrize(

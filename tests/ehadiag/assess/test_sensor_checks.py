@@ -14,12 +14,12 @@ from other_actuator import with_data
 from places import LOGS
 
 from ehadiag import Verdict, bundled_tests, default_actuator
-from ehadiag.assess.diagnosis import diagnose
-from ehadiag.assess.plausibility import (
+from ehadiag.assess.acceptance import (
     objections_to_actuator,
     objections_to_travel,
     objections_to_units,
 )
+from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.response_checks import (
     PositionFit,
     fit_position,
@@ -32,11 +32,12 @@ from ehadiag.identify.identification_session import identify
 from ehadiag_sim.broken_hardware import simulate_broken
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.simulation import simulate
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 NAMES = ("healthy-open.blf", "paper-open-4.blf", "lossy-open.blf", "hot-worn-closed.asc")
 ACTUATOR = default_actuator()
+CLOSED = bundled_tests()["closed"]
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -45,7 +46,7 @@ def samples(request):
 
 
 def test_sound_sensors_are_not_complained_of(samples):
-    assert objections_to_travel(samples, ACTUATOR) == []
+    assert objections_to_travel(samples, CLOSED, ACTUATOR) == []
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3])
@@ -55,7 +56,7 @@ def test_lost_samples_are_no_reason(samples, share):
         name: np.where(rng.random(samples.ticks) < share, np.nan, getattr(samples, name))
         for name in ("spool", "position")
     }
-    assert objections_to_travel(replace(samples, **lost), ACTUATOR) == []
+    assert objections_to_travel(replace(samples, **lost), CLOSED, ACTUATOR) == []
 
 
 @pytest.mark.parametrize(
@@ -73,15 +74,15 @@ def test_lost_samples_are_no_reason(samples, share):
 )
 def test_another_motion_is_named(samples, change, words):
     changed = replace(samples, **{name: make(samples) for name, make in change.items()})
-    (reason,) = objections_to_travel(changed, ACTUATOR)
+    (reason,) = objections_to_travel(changed, CLOSED, ACTUATOR)
     assert reason.startswith(words)
 
 
 def test_nothing_is_said_where_nothing_moves_or_is_known(samples):
     still = {name: 0.0 * getattr(samples, name) for name in ("spool", "position")}
-    assert objections_to_travel(replace(samples, **still), ACTUATOR) == []
+    assert objections_to_travel(replace(samples, **still), CLOSED, ACTUATOR) == []
     unknown = replace(samples, position=np.full(samples.ticks, np.nan))
-    assert objections_to_travel(unknown, ACTUATOR) == []
+    assert objections_to_travel(unknown, CLOSED, ACTUATOR) == []
 
 
 @pytest.mark.parametrize("kind", ["swapped-spool-position", "swapped-pressure-position"])

@@ -16,7 +16,7 @@ import pytest
 from msgspec.structs import replace
 
 from ehadiag import bundled_tests, default_actuator
-from ehadiag.assess.acceptance import residual_limits
+from ehadiag.assess.verdict import residual_limits
 from ehadiag.calibration import calibrate_unit, model_choice
 from ehadiag.calibration.calibrate_unit import calibrate, learn_as_new
 from ehadiag.calibration.calibration_session import CalibrationSession, RecordingSelection

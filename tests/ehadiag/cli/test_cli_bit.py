@@ -26,8 +26,8 @@ from ehadiag.model.residual_models import SimdModel
 from ehadiag.setup import Deadline
 from ehadiag_sim.emulator import FccCore, emulator_in_thread
 from firmware_iface.codec import Encoder
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import BitState
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.frames import Frame
 from firmware_iface.transport.python_can import PythonCanTransport

@@ -26,7 +26,7 @@ from ehadiag.assess import acceptance, lost_samples
 from ehadiag.cli.main import parser_and_commands
 from ehadiag_tools.rigs.replay import as_sent
 from ehadiag_tools.rigs.rerecord import Disturbance, ForeignBus, frames_on, logged, played
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 from firmware_iface.transport.frames import FrameTable
 

@@ -20,11 +20,11 @@ import pytest
 from cli_result import Run
 from places import LOGS
 
-from ehadiag.batch.workers import expand_logs
 from ehadiag.cli.command_parser import CommandParser
+from ehadiag.cli.diagnose_commands import expand_logs
 from ehadiag.cli.main import parse_arguments, parser_and_commands
 from ehadiag.terminal import output
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 
 HEALTHY = LOGS / "healthy-open.blf"
 

@@ -23,9 +23,9 @@ from places import LOGS, ROOT
 from stored_results import LINES, former_result
 from two_actuators import write_log, write_mappings
 
-from ehadiag.batch.result_files import BatchSummary, junit_report, result_columns, summary_lines
+from ehadiag.batch.result_files import junit_report, result_columns
 from ehadiag.result import Result
-from ehadiag.terminal.output import worst_exit_code
+from ehadiag.terminal.output import BatchSummary, summary_lines, worst_exit_code
 
 HEALTHY = LOGS / "healthy-open.blf"
 WORN = LOGS / "paper-open-4.blf"

@@ -14,7 +14,7 @@ import pytest
 from cli_result import COMMAND, REPOSITORY
 from places import LOGS
 
-from ehadiag.compile.sources import cache_folder
+from ehadiag.compile.libraries import cache_folder
 
 LOOPNET = REPOSITORY / "tools" / "loopnet.sh"
 NO_NAMESPACE = 125

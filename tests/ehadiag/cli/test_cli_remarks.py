@@ -13,9 +13,10 @@ from places import LOGS
 from ehadiag import Diagnosis, Recording, Verdict, bundled_tests, default_actuator
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.identify.identification_session import NuisanceMode
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.recording import BitOutcome, BitState, Environment
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.transport.frames import Frame, FrameTable
 
 TELEMETRY, COMMAND, ENVIRONMENT = 0x110, 0x111, 0x120

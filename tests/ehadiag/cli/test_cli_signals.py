@@ -24,8 +24,8 @@ from ehadiag.core.interruption import (
     stop_on_signals,
 )
 from ehadiag.session.bit_run import STOPPED_TWICE_REASON, EarlyIdentification
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import BitState
+from firmware_iface.signals.recordings import read_recording
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 ALL = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -20,7 +20,7 @@ from cli_result import COMMAND, Run
 from places import LOGS
 
 import ehadiag
-from ehadiag.compile.sources import cache_folder
+from ehadiag.compile.libraries import cache_folder
 from firmware_iface.bus_map import default_map
 
 SHOW = """

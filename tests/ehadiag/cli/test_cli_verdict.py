@@ -34,8 +34,8 @@ from ehadiag.assess.verdict import VerdictRule, judge
 from ehadiag.cli import diagnose_commands as command
 from ehadiag.setup import RecordedTest, Setup
 from ehadiag.terminal.output import exit_code_of_inputs, worst_exit_code
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import BitOutcome, BitReason, BitState, Environment
+from firmware_iface.signals.recordings import read_recording
 
 TESTS = bundled_tests()
 

@@ -23,7 +23,7 @@ from ehadiag_sim.foreign_plant import ForeignPlant
 from ehadiag_sim.simulation import Plant, simulate
 from ehadiag_tools.onboard.replay import ticks_of, unit_of
 from firmware_iface.files import RESULT_MODE, Folder
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 
 fmpy = pytest.importorskip("fmpy")
 TICK = 1e-3

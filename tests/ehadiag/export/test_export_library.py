@@ -32,7 +32,7 @@ from ehadiag_tools.onboard.replay import (
     unit_of,
 )
 from ehadiag_tools.onboard.study import REFERENCE
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 
 SEVERITIES = (0.3, 0.4, 0.2)
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]

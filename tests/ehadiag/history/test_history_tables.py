@@ -9,8 +9,8 @@ import pytest
 from history_cases import an_entry
 
 from ehadiag.cli.main import main
+from ehadiag.history.records import entries_from_csv, history_csv, history_parquet
 from ehadiag.history.store import History
-from ehadiag.history.tables import entries_from_csv, history_csv, history_parquet
 from ehadiag.model.registry import FAULT_NAMES
 from firmware_iface.errors import ConfigurationError
 

@@ -33,7 +33,7 @@ from ehadiag.identify.prior import unit_prior
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, parameter
 from ehadiag_tools.accuracy import verdicts
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import bundled_tests
 
 STD = 1e-3

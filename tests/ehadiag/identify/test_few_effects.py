@@ -14,7 +14,7 @@ import pytest
 from msgspec.structs import replace
 
 from ehadiag import default_actuator
-from ehadiag.assess.acceptance import objections_to_estimate
+from ehadiag.assess.verdict import objections_to_estimate
 from ehadiag.core.actuator import with_tolerance
 from ehadiag.identify import nuisance_estimate
 from ehadiag.identify.experiment import build_experiment

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ehadiag import default_actuator
-from ehadiag.assess.acceptance import objections_to_estimate
+from ehadiag.assess.verdict import objections_to_estimate
 from ehadiag.identify.estimates import is_pressure_misfit, is_unexplainable, signal_excess_costs
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.identification_session import identify

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ehadiag import CommandMode, live
-from ehadiag.estimate import Severity, finite
+from ehadiag.core.conventions import finite
+from ehadiag.estimate import Severity
 from ehadiag.live import (
     Alarm,
     BusState,

@@ -24,8 +24,8 @@ from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, parameter
 from ehadiag.model.residual_models import ScalarModel, SimdModel, model_response
 from ehadiag_tools.simulator.units import damaged_unit
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 CORNERS = np.array(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0])).reshape(3, 8).T

@@ -27,8 +27,8 @@ from ehadiag.identify.experiment import build_experiment
 from ehadiag.model.batch import NO_ANCHOR, Anchor
 from ehadiag.model.residual_models import model_response
 from ehadiag_tools.simulator.units import damaged, damaged_unit
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 MATCHED = {

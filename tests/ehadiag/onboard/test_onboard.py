@@ -28,7 +28,7 @@ from ehadiag.export.library import exported_unit, library_plan
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD, REASONS, OnboardOutcome
 from ehadiag_tools.onboard.replay import surrounded, ticks_of
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 
 PLAN = library_plan(default_actuator(), design_cusum(FALSE_ALARM_INTERVAL_H, 1e-3))
 NOT_TESTED = 30.0

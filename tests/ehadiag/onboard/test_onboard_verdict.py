@@ -42,8 +42,8 @@ from ehadiag.onboard.onboard_memory import (
     set_environment,
 )
 from ehadiag_tools.onboard.replay import surrounded, ticks_of
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS
+from firmware_iface.signals.recordings import read_recording
 
 LEVELS = verdict.Levels()
 TESTS = bundled_tests().values()

@@ -20,15 +20,22 @@ from rich.console import Console
 import ehadiag
 from ehadiag import Levels
 from ehadiag.batch.result_files import csv_table
-from ehadiag.cli.history_options import append_result
 from ehadiag.cli.main import main
+from ehadiag.cli.result_output import append_result
 from ehadiag.estimate import Culprit, Effect
 from ehadiag.history.records import Usage
 from ehadiag.prognosis.forecast import RemainingLife
-from ehadiag.report.head import head_of, percent, remaining_sentences, stored_test_name
+from ehadiag.report.head import (
+    NAMED_COLUMNS,
+    diagnosis_html,
+    head_of,
+    percent,
+    print_result,
+    stored_test_name,
+)
+from ehadiag.report.prognosis_tables import remaining_sentences
 from ehadiag.report.report_pages import diagnosis_page
 from ehadiag.report.response_signals import result_picture
-from ehadiag.report.result_tables import NAMED_COLUMNS, diagnosis_html, print_result
 from ehadiag.report.signal_files import signal_file
 from ehadiag.result import Onboard, OnboardFault
 from ehadiag.session.bit_run import BitView

@@ -22,8 +22,9 @@ from ehadiag_sim.conditions import Faults
 from ehadiag_sim.emulator import EmulatorTransport, emulated_computer
 from firmware_iface.bus_map import default_map
 from firmware_iface.live_decode import BitRequest, LiveDecoder
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import BitState, Environment
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import bundled_tests
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.frames import Frame

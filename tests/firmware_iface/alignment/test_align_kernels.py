@@ -83,13 +83,13 @@ def grid(tick: list[int], value: list[float], **other: Any) -> TickGrid:
         values={"channels.spool": np.array(value)},
         time_ns=100 + np.arange(count),
         saturated=other.get("saturated", {}),
+        message=SimpleNamespace(name="M"),
     )
-    known = {"channels.spool": (SimpleNamespace(name="M"), None)}
     return TickGrid(
         episode=span(10, 4),
-        decoded=SimpleNamespace(messages={"M": item}),
+        decoded=SimpleNamespace(messages={"M": item}, message_of={"channels.spool": "M"}),
         axis=axis_of([], [], other.get("ticks", {"M": tick})),
-        bus_map=SimpleNamespace(find=known.get),
+        bus_map=SimpleNamespace(),
         begin=other.get("begin", 0),
         end=other.get("end", 2 * count),
     )
@@ -264,6 +264,7 @@ def test_the_environment_is_the_median_over_the_test() -> None:
         time_ns=100_000_000 * row,
         data=np.arange(40, dtype=np.uint8).reshape(5, 8),
         counter=None,
+        modulus=0,
         stream=np.zeros(5, dtype=np.int64),
         values={
             "environment.supply_pressure": np.array([1.0, 20.0, 30.0, NAN, 90.0]),
@@ -330,12 +331,16 @@ def test_a_frozen_channel_is_noted_with_its_time() -> None:
 )
 def test_steps_of_the_bus_are_a_standard_deviation(scale: float, gain: float, std: float) -> None:
     signal = SimpleNamespace(is_float=False, scale=scale, offset=0.0)
-    role = SimpleNamespace(signal=signal, gain=gain, bias=0.0)
-    bus_map: Any = SimpleNamespace(find=lambda _: (None, role))
-    assert align._rounding_std(bus_map, "oil_temperature") == pytest.approx(std)
-    both = align._rounding_std(bus_map, "supply_pressure", "return_pressure")
+    names = ("oil_temperature", "supply_pressure", "return_pressure")
+    roles = [
+        SimpleNamespace(name=f"environment.{name}", signal=signal, gain=gain) for name in names
+    ]
+    item = SimpleNamespace(message=SimpleNamespace(roles=roles))
+    decoded: Any = SimpleNamespace(messages={"M": item})
+    assert align._rounding_std(decoded, "oil_temperature") == pytest.approx(std)
+    both = align._rounding_std(decoded, "supply_pressure", "return_pressure")
     assert both == pytest.approx(math.sqrt(2.0) * std)
     signal.is_float = True
-    assert align._rounding_std(bus_map, "oil_temperature") == 0.0
-    nothing: Any = SimpleNamespace(find=lambda _: None)
+    assert align._rounding_std(decoded, "oil_temperature") == 0.0
+    nothing: Any = SimpleNamespace(messages={})
     assert align._rounding_std(nothing, "oil_temperature") == 0.0

@@ -89,6 +89,8 @@ def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(pages, senders):
         data=np.arange(8 * count, dtype=np.uint8).reshape(count, 8),
         time_ns=np.arange(count) * 50_000_000,
         counter=np.arange(count) * 101 % 256,
+        modulus=256,
+        counted=None,
         values={"environment.oil_temperature": np.full(count, 40.0)},
     )
     assert len(slow_values(frames, 0, count, 3_000_000_000)[1]) == senders
@@ -129,7 +131,8 @@ def counted(row, counter=None, stream=None, **bad):
     """What counting reads of a decoded message of 256 counts."""
     empty = np.empty(0, dtype=np.int64)
     return SimpleNamespace(
-        message=SimpleNamespace(name="M", modulus=256),
+        message=SimpleNamespace(name="M"),
+        modulus=256,
         row=np.array(row),
         counter=None if counter is None else np.array(counter),
         stream=np.zeros(len(row), dtype=np.int64) if stream is None else np.array(stream),

@@ -22,8 +22,8 @@ from firmware_iface.alignment.ticks import place_late, settle_gaps, spacing_of
 from firmware_iface.codec import Encoder
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.live_decode import DOUBTFUL_TICKS, LiveDecoder, LiveTicks
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.protection import SenderWatch, conflicting
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.transport.frames import concatenate
 
 COUNT = 4000

@@ -20,8 +20,8 @@ from ehadiag import diagnose
 from ehadiag.cli.main import main
 from ehadiag_tools.onboard.replay import EMULATED, identified, missing, surrounded, ticks_of
 from firmware_iface import tester
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import OnboardState
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.transport.frames import Frame
 
 NOTHING, RECORDING, IDENTIFYING, DONE, GIVEN_UP = OnboardState

@@ -18,10 +18,9 @@ from onboard_frames import SEVERITIES, findings, progress
 from places import ROOT
 
 from ehadiag import CommandMode, ConfigurationError
-from firmware_iface.alignment.status import OnboardReader
 from firmware_iface.bus_map import default_map, load_map
 from firmware_iface.codec import Encoder, decode
-from firmware_iface.live_decode import LiveDecoder
+from firmware_iface.live_decode import LiveDecoder, OnboardReader
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import CHANNELS, BitReason, BitState, OnboardState
 from firmware_iface.transport.frames import FrameTable

@@ -183,7 +183,8 @@ def item(time_ms: list[float], counter: list[int], stream: list[int] | None = No
         row=np.rint(np.array(time_ms) * 10).astype(np.int64),
         time_ns=np.rint(np.array(time_ms) * MS).astype(np.int64),
         counter=np.array(counter),
-        message=SimpleNamespace(name="M", modulus=256),
+        message=SimpleNamespace(name="M"),
+        modulus=256,
         stream=np.array(stream or [0] * len(time_ms)),
     )
 

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from ehadiag import Recording
 from ehadiag_sim.control import FrameMoment
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.logs.recorder import Recorder
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.tester import Assembler
 from firmware_iface.transport.frames import Frame
 

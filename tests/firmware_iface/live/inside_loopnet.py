@@ -14,8 +14,8 @@ from test_live_contract import FRAMES, TwoWay, collect, content
 
 from ehadiag import default_actuator
 from ehadiag_sim.emulator import FccCore, run_emulator
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.logs.recorder import Recorder
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.tester import run_test
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.base import Transport, TransportState

@@ -26,9 +26,10 @@ from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.handshake import ChannelLimits, Phase, TimeLimits
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder, ReplayTransport
 from firmware_iface.recording import BitReason, BitState
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.tester import BitProgress, run_test
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.base import Transport

@@ -12,8 +12,9 @@ from test_logs import write
 
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import Encoder
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import Recording
+from firmware_iface.signals.recordings import read_recording
 
 FRAMES = play(Encoder(default_map()), make_truth(400))
 TEXT = (".log", ".asc", ".trc", ".csv")

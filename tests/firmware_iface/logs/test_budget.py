@@ -18,9 +18,10 @@ from firmware_iface.bus_map import load_map
 from firmware_iface.codec import Encoder
 from firmware_iface.dbc import MAX_MESSAGE_SIGNALS, MAX_SIGNALS, parse_dbc
 from firmware_iface.logs.log_files import FRAME_READERS, Budget
-from firmware_iface.logs.reader import iterate_recordings, read_frames, read_recording
+from firmware_iface.logs.reader import iterate_recordings, read_frames
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.signals.columns import ColumnMap
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.signals.tables import read_signals
 from firmware_iface.stored_test import resolve_test
 from firmware_iface.transport.frames import Frame
@@ -87,7 +88,7 @@ PEAK = """
 import re, sys
 from firmware_iface.errors import InputOutputError
 from firmware_iface.logs.log_files import Budget
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 try:
     recording = read_recording(sys.argv[1], budget=Budget(frames=int(sys.argv[2])))
     print(recording.samples.ticks, file=sys.stderr)

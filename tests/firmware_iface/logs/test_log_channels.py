@@ -20,15 +20,10 @@ from msgspec.structs import replace
 
 from ehadiag import ConfigurationError, InputOutputError
 from firmware_iface.bus_map import default_map
-from firmware_iface.logs.reader import (
-    choose_recording,
-    describe_recording,
-    read_frames,
-    read_recording,
-    read_recordings,
-)
+from firmware_iface.logs.reader import read_frames, read_recordings
 from firmware_iface.logs.recorder import Recorder, StoredLog
 from firmware_iface.recording import BitState
+from firmware_iface.signals.recordings import choose_recording, describe_recording, read_recording
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.frames import Frame
 from firmware_iface.transport.python_can import PythonCanTransport

@@ -14,8 +14,9 @@ import ehadiag
 from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs import log_files
 from firmware_iface.logs.log_files import holds_signals, known_suffixes
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.signals.columns import ColumnMap
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.signals.tables import read_signals
 from firmware_iface.transport.frames import FrameTable
 

@@ -18,8 +18,9 @@ from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import CommandMode, ConfigurationError, EhadiagError, InputOutputError, bundled_tests
-from firmware_iface.logs.reader import read_frames, read_recording, read_recordings
+from firmware_iface.logs.reader import read_frames, read_recordings
 from firmware_iface.recording import BitState
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.tester import Assembler
 from firmware_iface.transport.frames import Frame, FrameTable
 

@@ -22,8 +22,9 @@ from places import LOGS
 
 from ehadiag import InputOutputError
 from firmware_iface.logs.candump import candump_frames
-from firmware_iface.logs.reader import FrameLog, read_frames, read_recording
+from firmware_iface.logs.reader import FrameLog, read_frames
 from firmware_iface.logs.recorder import Recorder
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.transport.frames import Frame, FrameTable
 
 

@@ -13,7 +13,8 @@ from places import LOGS
 
 from ehadiag import InputOutputError
 from firmware_iface.logs.log_files import unpacked_log
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
+from firmware_iface.signals.recordings import read_recording
 
 LOG = LOGS / "paper-open-1.blf"
 

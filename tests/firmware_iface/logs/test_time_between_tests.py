@@ -10,9 +10,8 @@ from ehadiag_tools.rigs.replay import as_sent
 from ehadiag_tools.rigs.rerecord import BUSES, Disturbance, frames_on, played
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.find_test import CandidateTests
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.signals import recordings
-from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.signals.recordings import Interpretation, read_recording, recorded_tests
 
 SOUGHT = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
 WINDOW = 14_000

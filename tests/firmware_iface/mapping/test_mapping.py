@@ -27,9 +27,8 @@ from ehadiag import (
     load_actuator,
 )
 from ehadiag_sim.simulation import scales_of
-from firmware_iface.bus_map import default_map, load_map, signal_layout
+from firmware_iface.bus_map import default_map, load_map, si_factor, signal_layout
 from firmware_iface.dbc import SignalLayout, plain_message
-from firmware_iface.mapping_file import si_factor
 from firmware_iface.recording import DEFAULT_SCALES, BitState
 
 DATA = resources.files("firmware_iface").joinpath("data")

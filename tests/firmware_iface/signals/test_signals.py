@@ -24,7 +24,6 @@ from firmware_iface.bus_map import default_map
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs import log_files
 from firmware_iface.logs.log_files import Budget, holds_signals
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.signals import tables
 from firmware_iface.signals.columns import ColumnMap, load_columns, named_columns
 from firmware_iface.signals.held import (
@@ -34,7 +33,7 @@ from firmware_iface.signals.held import (
     placed_by_time,
     placed_in_order,
 )
-from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.signals.recordings import Interpretation, read_recording, recorded_tests
 from firmware_iface.signals.resample import TickClock, is_held, on_ticks
 from firmware_iface.signals.tables import RecordedSignal, even_times, join_tables, read_signals
 

@@ -23,9 +23,10 @@ from firmware_iface import tester
 from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import Encoder
-from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.recording import BitState
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.tester import run_test
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.base import Transport

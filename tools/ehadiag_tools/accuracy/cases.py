@@ -17,7 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ehadiag.assess.acceptance import objections_to_estimate
+from ehadiag.assess.verdict import objections_to_estimate
 from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag.core.actuator import Actuator, default_actuator, with_tolerance
 from ehadiag.identify.experiment import (
@@ -53,8 +53,8 @@ from ehadiag_tools.simulator.units import (
 )
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS, Environment, Recording, Samples
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
 Severities = tuple[float, float, float]

@@ -54,8 +54,8 @@ from ehadiag_tools.simulator.units import (
 )
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import Recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
 TESTS = ("open", "closed")

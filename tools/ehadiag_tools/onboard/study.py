@@ -47,7 +47,7 @@ from ehadiag_tools.onboard.replay import (
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import RESULT_MODE, Folder
-from firmware_iface.logs.reader import read_recording
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 SEVERITIES = (0.3, 0.4, 0.2)

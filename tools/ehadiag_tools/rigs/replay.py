@@ -43,8 +43,8 @@ from ehadiag_tools.study import Options, Record, Study, grouped
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
 from firmware_iface.find_test import CandidateTests
-from firmware_iface.logs.reader import choose_recording, read_recording
 from firmware_iface.recording import CHANNELS, CommandMode, Recording, Samples
+from firmware_iface.signals.recordings import choose_recording, read_recording
 from firmware_iface.stored_test import StoredTest, bundled_tests
 
 DAQ = "daq"

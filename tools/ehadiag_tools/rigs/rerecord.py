@@ -22,10 +22,9 @@ from firmware_iface.codec import TickEncoder
 from firmware_iface.dbc import parse_dbc
 from firmware_iface.files import decode_toml
 from firmware_iface.find_test import CandidateTests
-from firmware_iface.logs.reader import choose_recording
 from firmware_iface.mapping_file import MappingFile
 from firmware_iface.recording import CHANNELS, BitState, CommandMode, Recording, Samples
-from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.signals.recordings import Interpretation, choose_recording, recorded_tests
 from firmware_iface.stored_test import bundled_tests
 from firmware_iface.transport.frames import Frame, FrameTable
 

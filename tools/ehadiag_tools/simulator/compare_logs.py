@@ -29,8 +29,8 @@ from ehadiag_sim.simulation import bus_command
 from ehadiag_tools.simulator.units import Unit
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
-from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
+from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
 
 EFFECTS = "truth-effects.csv"
