@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib import resources
 from multiprocessing import get_context
@@ -137,7 +137,7 @@ def perform_cases(
         file.write("\n" if done else "")
         for key, found in performed:
             # Through JSON, so that a record is the same before and after a resumption.
-            line = json.dumps({**asdict(pending[key]), **found})
+            line = json.dumps({**asdict(pending[key]), **found}, default=str)
             done[key] = json.loads(line)
             file.write(f'{{"key": "{key}", {line[1:]}\n')
             file.flush()
@@ -188,6 +188,12 @@ def _read(path: Path) -> dict[str, Record]:
                 record = json.loads(line)
                 found[record.pop("key")] = record
     return found
+
+
+def case_of(kind: type[C], options: Options, **own: Any) -> C:
+    """Case of a study: its own settings, the others are the options of their names."""
+    names = {item.name for item in fields(kind)} - own.keys()
+    return kind(**{name: getattr(options, name) for name in names}, **own)
 
 
 def grouped(records: Iterable[Record], *names: str) -> dict[tuple[Any, ...], list[Record]]:

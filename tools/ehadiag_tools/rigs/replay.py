@@ -21,7 +21,6 @@ from scipy.interpolate import Akima1DInterpolator
 
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
-from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults, Sensors, UnmodelledEffects
 from ehadiag_sim.plant_dynamics import PlantDynamics
 from ehadiag_sim.plant_laws import PositionController
@@ -38,7 +37,7 @@ from ehadiag_tools.rigs.rerecord import (
     played,
     read_columns,
 )
-from ehadiag_tools.simulator.compare_logs import read_rows
+from ehadiag_tools.simulator.compare_logs import read_truth
 from ehadiag_tools.study import Options, Record, Study, grouped
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
@@ -64,7 +63,7 @@ class BusReplay:
     """
 
     recording: str
-    faults: tuple[float, float, float]
+    faults: tuple[float, ...]
     actuator: str
     bus: str
     how: Disturbance
@@ -170,18 +169,18 @@ def _cases(options: Options) -> list[BusReplay]:
 
 def _usual_cases(folder: Path, options: Options) -> Iterator[BusReplay]:
     """Recordings of a folder as they are; without those of units that are not calibrated."""
-    for row in read_rows(folder / "truth.csv", "file", *FAULT_NAMES):
-        path, actuator = folder / row["file"], ""
+    for truth in read_truth(folder):
+        path, actuator = Path(truth.path), ""
         if options.only and path.stem not in options.only:
             continue
-        if row.get("unit"):
-            unit = options.calibrated / f"{row['unit']}.toml" if options.calibrated else None
+        if truth.unit:
+            unit = options.calibrated / f"{truth.unit}.toml" if options.calibrated else None
             if unit is None or not unit.is_file() or "-new-" in path.name:
                 continue
             actuator = str(unit)
-        a, b, c = (float(row[name]) for name in FAULT_NAMES)
-        how = Disturbance()
-        yield BusReplay(str(path), (a, b, c), actuator, DEFAULT, how, options.rate, options.seed)
+        yield BusReplay(
+            truth.path, truth.faults, actuator, DEFAULT, Disturbance(), options.rate, options.seed
+        )
 
 
 def _foreign_cases(case: BusReplay, options: Options) -> Iterator[BusReplay]:
@@ -241,7 +240,7 @@ class DaqCase:
     """
 
     test: str
-    faults: tuple[float, float, float]
+    faults: tuple[float, ...]
     rate: float
     bits: int
     with_command: bool

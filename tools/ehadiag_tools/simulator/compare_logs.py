@@ -12,6 +12,7 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from ehadiag_tools.simulator.units import Unit
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
+from firmware_iface.recording import CHANNELS, CommandMode, Environment, Recording, Samples
 from firmware_iface.stored_test import resolve_test
 
 EFFECTS = "truth-effects.csv"
@@ -40,20 +41,19 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """One row of truth.csv: file, stored test, severities, unit."""
+    """A recording, its stored test and unit where the table says them, and its severities."""
 
-    file: str
+    path: str
     test: str
-    faults: Faults
-    unit: str = ""
+    unit: str
+    faults: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedCase:
-    """Folder and file of a recording, and whether commands are exact."""
+    """A recording, and whether commands are exact."""
 
-    folder: str
-    file: str
+    truth: Truth
     exact_command: bool
 
 
@@ -64,38 +64,36 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _cases(options: Options) -> list[RecordedCase]:
-    rows = read_truth(options.folder / "truth.csv")
     units = _units(options.folder)
-    folder = str(options.folder)
-    exact = options.exact_command
-    return [RecordedCase(folder, row.file, exact) for row in rows if row.unit in units]
+    return [
+        RecordedCase(truth, options.exact_command)
+        for truth in read_truth(options.folder)
+        if truth.unit in units
+    ]
 
 
 def _units(folder: Path) -> dict[str, Unit]:
     if (folder / EFFECTS).exists():
         return read_units(folder / EFFECTS, default_actuator())
-    return {row.unit: Unit() for row in read_truth(folder / "truth.csv")}
+    return {truth.unit: Unit() for truth in read_truth(folder)}
 
 
 def perform(case: RecordedCase) -> Record:
     """Replay one recording on the simulator; residuals in LSB."""
-    folder = Path(case.folder)
-    row = next(item for item in read_truth(folder / "truth.csv") if item.file == case.file)
-    recording = read_recording(folder / row.file)
-    if recording.samples is None:
-        raise InputOutputError(f"log {row.file}: no telemetry of a test in it")
-    test, unit = resolve_test(row.test), _units(folder)[row.unit]
+    truth, path = case.truth, Path(case.truth.path)
+    recording, samples = read_tested(path)
+    test, unit = resolve_test(truth.test), _units(path.parent)[truth.unit]
     command = test.command() if case.exact_command else bus_command(test)
-    if recording.samples.ticks != test.ticks:
-        raise InputOutputError(f"log {row.file}: not as long as test {test.name!r}")
+    if samples.ticks != test.ticks:
+        raise InputOutputError(f"log {path.name}: not as long as test {test.name!r}")
     effects = effects_of(recording.environment, unit.effects)
     gap = residuals(
-        unit.actuator, recording.samples, command, row.faults, effects, DEFAULT_STEP_S, unit.sensors
-    )
-    good = np.isfinite(gap).all(axis=0)
-    rms = np.sqrt(np.mean(gap[:, good] ** 2, axis=1))
-    largest = np.abs(gap[:, good]).max(axis=1)
-    return {"samples": int(good.sum()), "rms": rms.tolist(), "largest": largest.tolist()}
+        unit.actuator, samples, command, Faults(*truth.faults), effects, DEFAULT_STEP_S,
+        unit.sensors,
+    )  # fmt: skip
+    good = gap[:, np.isfinite(gap).all(axis=0)]
+    rms, largest = np.sqrt(np.mean(good**2, axis=1)), np.abs(good).max(axis=1)
+    return {"samples": good.shape[1], "rms": rms.tolist(), "largest": largest.tolist()}
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
@@ -105,18 +103,26 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     for item in records:
         pairs = zip(item["rms"], item["largest"], strict=True)
         cells = [f"{rms:.3f} ({largest:.1f})" for rms, largest in pairs]
-        rows.append((item["file"], item["samples"], *cells))
+        rows.append((Path(item["truth"]["path"]).name, item["samples"], *cells))
     yield from markdown(("file", "samples", *(channel.name for channel in CHANNELS)), rows)
 
 
-def read_truth(path: Path) -> list[Truth]:
-    """Read file names, tests and severities of truth.csv."""
+def read_tested(path: Path) -> tuple[Recording, Samples]:
+    """Read a recording that has samples."""
+    recording = read_recording(path)
+    if recording.samples is None:
+        raise InputOutputError(f"log {path.name}: no telemetry of a test in it")
+    return recording, recording.samples
+
+
+def read_truth(folder: Path) -> list[Truth]:
+    """Read truth.csv of a folder of recordings."""
     return [
         Truth(
-            row["file"], row["test"], Faults(*(float(row[name]) for name in FAULT_NAMES)),
-            row.get("unit", ""),
+            str(folder / row["file"]), row.get("test", ""), row.get("unit", ""),
+            tuple(row[name] for name in FAULT_NAMES),
         )
-        for row in read_rows(path, "file", "test", *FAULT_NAMES)
+        for row in read_rows(folder / "truth.csv", ("file",), FAULT_NAMES)
     ]  # fmt: skip
 
 
@@ -195,27 +201,33 @@ def _missing(law: PositionController, command: float, current: float, simulated:
     return min(codes, key=misfit) * CHANNELS.position.lsb
 
 
-def read_rows(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Read a table of comma-separated text; ConfigurationError: it has not all these columns."""
+def read_rows(path: Path, texts: Sequence[str], numbers: Sequence[str]) -> list[dict[str, Any]]:
+    """Read a table of comma-separated text; ConfigurationError: columns or numbers are missing."""
     with path.open(encoding="utf-8", newline="") as file:
         table = csv.DictReader(file)
-        if lacking := [name for name in columns if name not in (table.fieldnames or ())]:
+        if lacking := [name for name in (*texts, *numbers) if name not in (table.fieldnames or ())]:
             raise ConfigurationError(f"{path}: without column {', '.join(lacking)}")
-        return list(table)
+        rows: list[dict[str, Any]] = list(table)
+    for row, name in product(rows, numbers):
+        try:
+            row[name] = float(row[name] or "")
+        except ValueError:
+            raise ConfigurationError(f"{path}: {name} {row[name]!r} is not a number") from None
+    return rows
 
 
 def read_units(path: Path, actuator: Actuator) -> dict[str, Unit]:
     """Read `truth-effects.csv`, columns unit, effect, value: units of an actuator by name."""
     units: dict[str, Unit] = {}
-    for row in read_rows(path, "unit", "effect", "value"):
-        name = row["unit"]
-        units[name] = _with_effect(units.get(name, Unit(actuator)), row["effect"], row["value"])
+    for row in read_rows(path, ("unit", "effect"), ("value",)):
+        unit = units.get(row["unit"], Unit(actuator))
+        units[row["unit"]] = _with_effect(unit, row["effect"], row["value"])
     return units
 
 
-def _with_effect(unit: Unit, effect: str, text: str) -> Unit:
+def _with_effect(unit: Unit, effect: str, value: float) -> Unit:
     """Give a unit one effect of the table."""
-    effects, sensors, actuator, value = unit.effects, unit.sensors, unit.actuator, float(text)
+    effects, sensors, actuator = unit.effects, unit.sensors, unit.actuator
     changes: dict[str, dict[str, Any]] = {
         "torque motor gain": {"gain_change": value - 1.0},
         "hysteresis": {"hysteresis": value},
