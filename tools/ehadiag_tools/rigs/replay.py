@@ -31,7 +31,6 @@ from ehadiag_tools.rigs.rerecord import (
     BUSES,
     TESTS,
     Disturbance,
-    ForeignBus,
     frames_on,
     logged,
     played,
@@ -43,7 +42,7 @@ from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs.reader import choose_recording, read_recording
-from firmware_iface.recording import CHANNELS, CommandMode, Recording, Samples
+from firmware_iface.recording import CHANNELS, CommandMode, Recording
 from firmware_iface.stored_test import StoredTest, bundled_tests
 
 DAQ = "daq"
@@ -85,59 +84,29 @@ def _judged(read: Callable[[], Recording], actuator: Actuator) -> Record:
 
 
 def _played(case: BusReplay, recording: Recording, actuator: Actuator) -> Recording:
+    """Play a recording as the case has it, and read it there as `diagnose` does."""
     if case.bus == DEFAULT:
         return recording
+    if recording.samples is None:
+        raise ValueError(f"{recording.source}: nothing to play")
     test = next(item for item in TESTS if item.id == recording.test_id)
+    this, name = played(recording.samples, as_sent(test), case.how.lead_in_s), case.recording
     if case.bus == DAQ:
-        return on_daq(recording, test, case.how, actuator, case.seed, case.rate)
-    return on_bus(BUSES[case.bus], recording, test, case.how, actuator, case.seed)
-
-
-@cache
-def _actuator(path: str) -> Actuator:
-    return load_actuator(Path(path)) if path else default_actuator()
-
-
-def on_bus(
-    bus: ForeignBus,
-    recording: Recording,
-    test: StoredTest,
-    how: Disturbance,
-    actuator: Actuator,
-    seed: int,
-) -> Recording:
-    """Play a recording on a bus, and read it there as a log of that bus is read."""
-    this = played(_samples_of(recording), as_sent(test), how.lead_in_s)
-    table, bus_map = frames_on(bus, recording, this, how, seed)
+        columns = logged(this, case.how, case.rate, recording.samples.period_ns, case.seed)
+        for probe in ("supply_pressure", "return_pressure", "oil_temperature"):
+            value = getattr(recording.environment, probe)
+            columns[probe] = np.full(len(columns["time"]), value)
+        return read_columns(columns, actuator, Path(name).stem)
+    table, bus_map = frames_on(BUSES[case.bus], recording, this, case.how, case.seed)
     candidates = CandidateTests(TESTS, actuator.controller)
-    name = f"{Path(recording.source).stem} on {bus.name}"
     return choose_recording(
         windowed_recordings([table], bus_map, name, len(table) + 1, candidates=candidates)
     )
 
 
-def on_daq(
-    recording: Recording,
-    test: StoredTest,
-    how: Disturbance,
-    actuator: Actuator,
-    seed: int,
-    rate: float,
-) -> Recording:
-    """Write a recording as a decoded CSV at a rate (Hz), and read it as `diagnose` does."""
-    samples = _samples_of(recording)
-    this = played(samples, as_sent(test), how.lead_in_s)
-    columns = logged(this, how, rate, samples.period_ns, seed)
-    around = recording.environment
-    for name in ("supply_pressure", "return_pressure", "oil_temperature"):
-        columns[name] = np.full(len(columns["time"]), getattr(around, name))
-    return read_columns(columns, actuator, Path(recording.source).stem)
-
-
-def _samples_of(recording: Recording) -> Samples:
-    if recording.samples is None:
-        raise ValueError(f"{recording.source}: nothing to play")
-    return recording.samples
+@cache
+def _actuator(path: str) -> Actuator:
+    return load_actuator(Path(path)) if path else default_actuator()
 
 
 def as_sent(test: StoredTest) -> NDArray[np.float64]:
