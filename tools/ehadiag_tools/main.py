@@ -14,7 +14,7 @@ from ehadiag_tools.free_motion.motion import FREE_MOTION
 from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
 from ehadiag_tools.prognosis.units import PROGNOSIS
 from ehadiag_tools.rigs.replay import DAQ_RECORDINGS, FOREIGN_BUSES
-from ehadiag_tools.simulator.compare_logs import RECORDINGS
+from ehadiag_tools.simulator.units import RECORDINGS
 from ehadiag_tools.soak import SOAK
 from ehadiag_tools.study import Study, run_study
 

@@ -42,12 +42,13 @@ from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S
 from ehadiag_sim.simulation import simulate
 from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, cramer_rao, percent_errors
-from ehadiag_tools.simulator.compare_logs import read_tested, read_truth
 from ehadiag_tools.simulator.units import (
     COARSE_STEP,
     Unit,
     add_group,
     damaged_unit,
+    read_tested,
+    read_truth,
     record,
     unit_with,
 )

@@ -43,12 +43,12 @@ from ehadiag_tools.accuracy.figures import (
     outcome,
     percent_errors,
 )
-from ehadiag_tools.simulator.compare_logs import read_truth
 from ehadiag_tools.simulator.units import (
     COARSE_STEP,
     Unit,
     add_group,
     random_unit,
+    read_truth,
     record,
     unit_with,
 )

@@ -36,7 +36,7 @@ from ehadiag_tools.rigs.rerecord import (
     played,
     read_columns,
 )
-from ehadiag_tools.simulator.compare_logs import read_truth
+from ehadiag_tools.simulator.units import read_truth
 from ehadiag_tools.study import Options, Record, Study, grouped
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
