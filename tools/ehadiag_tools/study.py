@@ -126,7 +126,7 @@ def perform_cases(
         kept.parent.mkdir(parents=True, exist_ok=True)
     with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1):
         # One thread each: the workers already fill the cores.
-        performed = Parallel(return_as="generator_unordered")(
+        performed = Parallel(batch_size=1, return_as="generator_unordered")(
             delayed(_performed)(study.perform, key, case) for key, case in pending.items()
         )
     # On stderr, so that reports can be redirected; only where someone sees it.

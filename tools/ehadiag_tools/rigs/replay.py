@@ -209,13 +209,13 @@ class DaqCase:
     """
 
     test: str
-    faults: tuple[float, ...]
     rate: float
     bits: int
     with_command: bool
     lead_in_s: float
     phase: float
     drift_ppm: float
+    faults: tuple[float, ...]
     seed: int
 
 
@@ -286,21 +286,14 @@ def perform_daq(case: DaqCase) -> Record:
 
 def _daq_cases(options: Options) -> list[DaqCase]:
     """Each kind of recording in turn, with severities, phase and clock of its own."""
-    kinds = [
-        (test, rate, bits, with_command)
-        for test in ("closed", "open")
-        for rate in RATES
-        for bits in NOISE_STEPS
-        for with_command in (False, True)
-    ]
+    kinds = list(itertools.product(("closed", "open"), RATES, NOISE_STEPS, (False, True)))
     out = []
     for number in range(options.cases):
-        test, rate, bits, with_command = kinds[number % len(kinds)]
         rng = np.random.default_rng([options.seed, number])
-        a, b, c = rng.uniform(0.0, 0.9, 3).round(3).tolist()
+        faults = tuple(rng.uniform(0.0, 0.9, 3).round(3).tolist())
         lead_in, phase, drift = rng.uniform((0.0, 0.0, -100.0), (1.5, 1.0, 100.0)).round(3).tolist()
         seed = int(rng.integers(1 << 31))
-        out.append(DaqCase(test, (a, b, c), rate, bits, with_command, lead_in, phase, drift, seed))
+        out.append(DaqCase(*kinds[number % len(kinds)], lead_in, phase, drift, faults, seed))
     return out
 
 

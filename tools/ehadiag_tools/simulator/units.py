@@ -127,13 +127,8 @@ def unit_with(
 
 def add_group(parser: argparse.ArgumentParser) -> None:
     """Add an option for groups of effects, see `random_unit`."""
-    parser.add_argument(
-        "--group",
-        action="append",
-        default=[],
-        choices=GROUPS,
-        help="further effects of the units; may be repeated (none)",
-    )
+    words = "further effects of the units; may be repeated (none)"
+    parser.add_argument("--group", action="append", default=[], choices=GROUPS, help=words)
 
 
 def record(
