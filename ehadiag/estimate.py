@@ -9,8 +9,6 @@ import msgspec
 
 from ehadiag.core.conventions import display_unit
 
-INTERVAL_STDS = 1.96
-"""Half width of an interval of 95 %, in standard deviations."""
 AT_BOUND, NOT_SHOWN = "at_bound", "not_shown"
 """Flags: the estimate stands at a bound; the test does not show this severity."""
 

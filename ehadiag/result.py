@@ -162,7 +162,7 @@ class OnboardFault(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Onboard(msgspec.Struct, frozen=True, kw_only=True):
-    """What the flight-control computer found itself."""
+    """Result of the identification on board the flight-control computer."""
 
     verdict: str | None
     test_id: int | None

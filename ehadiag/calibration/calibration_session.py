@@ -40,6 +40,7 @@ from ehadiag.identify.nuisance_estimate import NuisanceEstimate
 from ehadiag.identify.prior import DAILY_PRIORS, JointPrior
 from ehadiag.identify.ring import Ring
 from ehadiag.model.parameter import Parameter
+from ehadiag.model.plant import slip_speed
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import StoredTest
@@ -259,7 +260,7 @@ class CalibrationSession:
 
     def _sliding(self, actuator: Actuator, part: RecordingSelection) -> list[Experiment]:
         """Experiments to learn from."""
-        return [item.sliding(item.slip_speed()) for item in self.build(actuator, part)]
+        return [item.sliding(slip_speed(item.constants)) for item in self.build(actuator, part)]
 
     def _indices(self, part: RecordingSelection) -> list[int]:
         known = [(index, test) for index, test in enumerate(self._tests) if test is not None]

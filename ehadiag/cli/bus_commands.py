@@ -18,8 +18,8 @@ from ehadiag.cli.simulator_options import add_simulator_options, simulator_setti
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, LEAST_MONITORED
 from ehadiag.core.conversion import conversion_of
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.core.interruption import stop_on_signals
-from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.report.rendering import isolated_png
 from ehadiag.terminal.output import (
     INPUT_OUTPUT_EXIT_CODE,
@@ -202,7 +202,7 @@ def run_monitor(
     )
     assert found.result is not None
     stated = [
-        f"{item.name} {item.estimate:.3f} ± {INTERVAL_STDS * item.std:.3f}"
+        f"{item.name} {item.estimate:.3f} ± {NORMAL_HALF_WIDTH_95 * item.std:.3f}"
         for item in found.result.severities.values()
         if item.estimate is not None and item.std is not None
     ]

@@ -24,7 +24,7 @@ from ehadiag.cli.options import (
 )
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.core.conventions import shown_date, utc_time_text
-from ehadiag.estimate import INTERVAL_STDS
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.history.records import (
     DIAGNOSIS_TABLE,
     EVENT_TABLE,
@@ -331,7 +331,8 @@ def _read(arguments: argparse.Namespace) -> tuple[list[Entry], list[MaintenanceE
 
 def _entry_row(entry: Entry) -> tuple[str, ...]:
     severities = ", ".join(
-        f"{item.name} {item.estimate:.4f}" + f" ± {INTERVAL_STDS * item.std:.4f}" * entry.relied_on
+        f"{item.name} {item.estimate:.4f}"
+        + f" ± {NORMAL_HALF_WIDTH_95 * item.std:.4f}" * entry.relied_on
         for item in entry.severities
         if item.estimate is not None and item.std is not None
     )

@@ -22,7 +22,8 @@ import msgspec
 from msgspec.structs import replace
 
 from ehadiag.core.conventions import MAX_HISTORY_SERIAL, utc_text, utc_time_text
-from ehadiag.estimate import AT_BOUND, INTERVAL_STDS, NOT_SHOWN, Effect, Severity
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Effect, Severity
 from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, install_command, valid_text
 
@@ -535,7 +536,7 @@ def _severity_of(row: dict[str, str], severities: Sequence[str]) -> Severity:
     estimate, std = _number(row, "estimate"), _number(row, "std")
     low, high = _number(row, "low95"), _number(row, "high95")
     if estimate is not None and std is not None and None in (low, high):
-        low, high = estimate - INTERVAL_STDS * std, estimate + INTERVAL_STDS * std
+        low, high = estimate - NORMAL_HALF_WIDTH_95 * std, estimate + NORMAL_HALF_WIDTH_95 * std
     return Severity(
         name=row["severity"],
         estimate=estimate,

@@ -24,7 +24,7 @@ from ehadiag.identify.signals import (
 )
 from ehadiag.model.batch import NO_ANCHOR, POSITION_ROW, Anchor, Batch
 from ehadiag.model.parameter import Parameter, scaled_to_channels
-from ehadiag.model.plant import SLIP_TICKS, PlantConstants, relative_viscosity, slip_speed
+from ehadiag.model.plant import SLIP_TICKS, PlantConstants, relative_viscosity
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, unit_constants
 from firmware_iface.recording import (
     CHANNELS,
@@ -138,10 +138,6 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         """Return the same unit with another exponent of clogging; bridge: `BRG` above 0."""
         bridge = bridge if exponent > 0.0 else 0.0
         return replace(self, constants=self.constants._replace(CLE=exponent, BRG=bridge))
-
-    def slip_speed(self, severity: float = 0.0) -> float:
-        """Return the speed, m/s, below which a jack of a severity of `FDJ` slips in steps."""
-        return slip_speed(self.constants, severity)
 
     def sliding(self, slip_speed: float) -> Experiment:
         """Return the same without the pressure on a jack that stands or slides more slowly."""

@@ -71,7 +71,7 @@ from ehadiag.identify.staged_search import (
     stage_ready_at,
     staged_search,
 )
-from ehadiag.model.plant import PlantConstants
+from ehadiag.model.plant import PlantConstants, slip_speed
 from ehadiag.model.registry import FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
@@ -217,7 +217,10 @@ class IdentificationSession:
             or law == 0.0
             or alike
             or found.fit.unexplained_outliers > FIT.max_outlier_share_poor_calibration
-            or (prior.joint is not None and any(item.slip_speed() > 0.0 for item in experiments))
+            or (
+                prior.joint is not None
+                and any(slip_speed(item.constants) > 0.0 for item in experiments)
+            )
         ):
             return found
         mode = self.nuisances if found.freed else NuisanceMode.NONE

@@ -63,6 +63,7 @@ from ehadiag.identify.posterior import (
 from ehadiag.identify.prior import UnitPrior, density_about, prior_density, prior_information
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
+from ehadiag.model.plant import slip_speed
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
 from ehadiag.model.severities import FAULT_LAWS
@@ -390,7 +391,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         alone.
         """
         calibrated = self.prior.joint is not None
-        if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
+        if calibrated and any(slip_speed(item.constants) > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
         if not found.explained and any(item.origin_read for item in experiments):
@@ -462,7 +463,9 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             return replace(found, better_exponent=better, exponent_doubted=doubted)
         names = [item.name for item in staged.model.estimated]
         values = dict(zip(names, staged.found.density.x * staged.model.scale, strict=True))
-        slow = max(item.slip_speed(min(max(values["FDJ"], 0.0), 1.0)) for item in experiments)
+        slow = max(
+            slip_speed(item.constants, min(max(values["FDJ"], 0.0), 1.0)) for item in experiments
+        )
         sliding = [item.sliding(slow) for item in experiments]
         found = self._with(sliding, self.prior, values, before)
         loose = self._with_changed_effects(sliding, found, values, budget=1)

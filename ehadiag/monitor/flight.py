@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from ehadiag.compile.jit import Array, Array2
-from ehadiag.estimate import AT_BOUND, INTERVAL_STDS, NOT_SHOWN, Severity
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity
 from ehadiag.model.registry import FAULTS
 from ehadiag.monitor.score_bank import BLOCK_S, REST, BlockScore, ScoreBank
 from firmware_iface import FREE_MOTION
@@ -84,7 +85,7 @@ class FlightEstimate:
                 unknown = Severity(name=item.name, meaning=item.short, flags=(NOT_SHOWN,))
                 out.append(unknown)
                 continue
-            value, reach = min(max(given + change * step, 0.0), 1.0), INTERVAL_STDS * std
+            value, reach = min(max(given + change * step, 0.0), 1.0), NORMAL_HALF_WIDTH_95 * std
             out.append(Severity(
                 name=item.name, meaning=item.short, estimate=float(value), std=float(std),
                 interval95=(float(max(value - reach, 0.0)), float(min(value + reach, 1.0))),

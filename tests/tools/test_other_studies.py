@@ -17,7 +17,6 @@ from ehadiag_tools.free_motion.motion import (
     ALL_KINDS,
     Motion,
     MotionCase,
-    changed,
     free_motion,
     garwood,
     perform,
@@ -55,7 +54,8 @@ def test_commands_of_a_kind_stay_in_range_and_move(kind: str) -> None:
 
 @pytest.mark.slow
 def test_a_growth_raises_an_alarm_with_its_name_and_none_before() -> None:
-    motion = changed(Motion("gusts", "position", 90.0, (0.3, 0.3, 0.3), 1), "FSS", 0.1, 45.0)
+    severities, change = (0.3, 0.3, 0.3), {"change": "FSS", "size": 0.1, "after": 45.0}
+    motion = Motion("gusts", "position", 90.0, severities, 1, **change)
     (when, causes), *_ = perform(MotionCase(motion, 10.0))["alarms"]
     assert 45.0 < when < 85.0
     assert causes[0][0] == "FSS"

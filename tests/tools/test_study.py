@@ -199,11 +199,14 @@ def test_a_longer_study_makes_its_table(
         (["recorded-units", "--recordings", "nowhere"], "nowhere/truth.csv: No such file"),
         (["foreign-buses", "nowhere"], "nowhere/truth.csv: No such file"),
         (["recorded-units", "--recordings", str(LOGS)], "truth.csv: no recording of a unit as new"),
+        (["recordings", "{folder}"], "truth.csv: FSS 'worn' is not a number"),
     ],
 )
 def test_wrong_use_is_one_plain_line(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "truth.csv").write_text("file,Kintas,FSS,FDJ\na.blf,0.1,worn,0.1\n")
+    arguments = [word.format(folder=tmp_path) for word in arguments]
     code = main([*arguments, "--resume", str(tmp_path / "r.jsonl")])
     error = capsys.readouterr().err.strip()
     assert code in (2, 3)

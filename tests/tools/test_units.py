@@ -7,10 +7,17 @@ import pytest
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag_sim.conditions import DataErrors, Effects, Faults, UnmodelledEffects
+from ehadiag_sim.simulation import bus_command
 from ehadiag_tools.main import main
-from ehadiag_tools.simulator import compare_logs
-from ehadiag_tools.simulator.compare_logs import read_units, replay
-from ehadiag_tools.simulator.units import STRANGE_SIZES, Unit, random_unit, record
+from ehadiag_tools.simulator.units import (
+    STRANGE_SIZES,
+    Unit,
+    random_unit,
+    read_units,
+    record,
+    replay,
+    residuals,
+)
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import bundled_tests
@@ -83,10 +90,10 @@ def test_replay_of_a_unit_leaves_the_noise_floor(test, seed):
     item = unit(seed, **EVERYTHING)
     faults = Faults(0.3, 0.2, 0.5)
     recording = record(item, TESTS[test], faults, seed=3, step=1e-5)
-    gap = compare_logs.residuals(
+    gap = residuals(
         item.actuator,
         recording.samples,
-        compare_logs.bus_command(TESTS[test]),
+        bus_command(TESTS[test]),
         faults,
         item.effects,
         1e-5,
@@ -99,7 +106,7 @@ def test_replay_of_a_unit_leaves_the_noise_floor(test, seed):
 def test_replay_without_the_effects_does_not():
     item = unit(2)
     recording = record(item, TESTS["open"], seed=3, step=1e-5)
-    command = compare_logs.bus_command(TESTS["open"])
+    command = bus_command(TESTS["open"])
     truth = replay(ACTUATOR, recording.samples, command, Faults(), Effects(), 1e-5)
     assert np.abs(truth[1] - recording.samples.spool).max() > 10 * CHANNELS[1].lsb
 
@@ -146,7 +153,12 @@ def test_table_of_recorded_units(tmp_path):
 
 @pytest.mark.parametrize(
     ("row", "words"),
-    [("A,rust,1", "effect 'rust'"), ("A,hysteresis,7", "hysteresis: 7 is outside")],
+    [
+        ("A,rust,1", "effect 'rust'"),
+        ("A,hysteresis,7", "hysteresis: 7 is outside"),
+        ("A,hysteresis,much", "value 'much' is not a number"),
+        ("A,hysteresis", "value None is not a"),
+    ],
 )
 def test_what_no_unit_has_is_refused(tmp_path, row, words):
     path = tmp_path / "truth-effects.csv"
@@ -155,7 +167,7 @@ def test_what_no_unit_has_is_refused(tmp_path, row, words):
         read_units(path, ACTUATOR)
 
 
-def test_compare_logs_leaves_out_units_without_effects(tmp_path, capsys):
+def test_recordings_leave_out_units_without_effects(tmp_path, capsys):
     (tmp_path / "truth.csv").write_text("file,unit,test,Kintas,FSS,FDJ\nd.blf,D,open,0,0,0\n")
     (tmp_path / "truth-effects.csv").write_text("unit,effect,value\nA,hysteresis,0.01\n")
     assert main(["recordings", str(tmp_path), "--resume", str(tmp_path / "kept.jsonl")]) == 0

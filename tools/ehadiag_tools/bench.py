@@ -11,6 +11,7 @@ import itertools
 import json
 import os
 import platform
+import re
 import shutil
 import statistics
 import subprocess
@@ -18,12 +19,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from io import StringIO
 from pathlib import Path
 
 import can
@@ -33,24 +33,25 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 import ehadiag
-from ehadiag.cli.main import main
 from ehadiag.compile.vector import LANES
 from ehadiag.core.actuator import default_actuator
-from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, Usage, history_entry
 from ehadiag.history.store import History
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, unknowns_of
+from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.identification_session import identify
 from ehadiag.identify.solvers import SEARCH_CAP
-from ehadiag.model.registry import FAULTS, ResidualModel
+from ehadiag.model.registry import FAULT_NAMES, FAULTS, ResidualModel
 from ehadiag.model.residual_models import ScalarModel, SimdModel
 from ehadiag.monitor.streaming import Monitor, Tick
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.accuracy.figures import NOT_TESTED
+from ehadiag_tools.study import Options, Record, Study, case_of, markdown
 from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import decode
 from firmware_iface.errors import InputOutputError
 from firmware_iface.logs.reader import read_frames
+from firmware_iface.logs.recorder import Recorder, ReplayTransport
 from firmware_iface.recording import Recording, Samples
 from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import resolve_test
@@ -59,8 +60,6 @@ from firmware_iface.transport.frames import FrameTable
 LOGS = Path(__file__).parents[2] / "tests" / "data" / "logs"
 OPEN = "paper-open-2"
 """The recording that most figures are of."""
-TRUTH = (0.3, 0.6, 0.3)
-"""Its severities, 1."""
 HEALTHY = "healthy-closed"
 """Recording of a healthy actuator, whose spool keeps breaking away."""
 TIMEOUT_S = 60.0
@@ -80,7 +79,7 @@ class BenchCase:
     frames: int
     recordings: int
     diagnoses: int
-    folder: str
+    folder: Path
     seed: int
 
 
@@ -102,73 +101,55 @@ def reference_experiment(name: str = OPEN) -> Experiment:
     return build_experiment(samples, recording.environment, test, default_actuator())
 
 
-def _cpu_median(work: Callable[[], object], repeats: int) -> float:
-    """Median CPU time (s) of this thread for a call, after one that does not count."""
+def _medians(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median wall and processor time (s) of a call, after one that does not count."""
     work()
     spent = []
-    for _ in range(repeats):
-        begin = time.thread_time()
+    for _ in range(max(1, repeats)):
+        wall, cpu = time.perf_counter(), time.process_time()
         work()
-        spent.append(time.thread_time() - begin)
-    return statistics.median(spent)
-
-
-def _each(seconds: float, ticks: int) -> str:
-    """Say what a time of so many ticks is for one."""
-    return f"{seconds * 1e9 / ticks:.3g} ns a tick"
+        spent.append((time.perf_counter() - wall, time.process_time() - cpu))
+    wall, cpu = np.median(spent, axis=0).tolist()
+    return wall, cpu
 
 
 def _kernels(case: BenchCase) -> Iterator[Figure]:
     """The model on the recording, candidates in blocks and one alone."""
     experiment = reference_experiment()
     batch, unknowns = lay_out_spans([experiment]), unknowns_of([experiment], FAULTS)
-    lanes = SimdModel(batch, unknowns, threads=1)
-    ticks, took = experiment.ticks, 0.0
-    for size in (1, LANES // 4, LANES, LANES + 1, 4 * LANES):
-        took = _evaluation(lanes, size, case.repeats)
-        name = f"one evaluation of the 5.5 s test, population {size}"
-        yield name, took * 1e3, "ms", _each(took, ticks)
-    alone = _evaluation(ScalarModel(batch, unknowns), LANES, max(1, case.repeats // 3))
-    yield "one run of the 5.5 s test alone", alone * 1e3, "ms", _each(alone, ticks)
-    yield "blocks faster than one alone", alone / took, "times", ""
-
-
-def _evaluation(model: ResidualModel, size: int, repeats: int) -> float:
-    """CPU time of one candidate of a population, s."""
-    population = np.random.default_rng(0).uniform(0.0, 1.0, (size, len(FAULTS)))
-    return _cpu_median(partial(model.costs, population, SEARCH_CAP), repeats) / size
+    lanes, alone = SimdModel(batch, unknowns, threads=1), ScalarModel(batch, unknowns)
+    evaluation = "one evaluation of the 5.5 s test"
+    models: dict[str, tuple[ResidualModel, int, int]] = {
+        f"{evaluation}, population {size}": (lanes, size, case.repeats)
+        for size in (1, LANES // 4, LANES, LANES + 1, 4 * LANES)
+    }
+    models["one run of the 5.5 s test alone"] = alone, LANES, case.repeats // 3
+    took = []
+    for name, (model, size, repeats) in models.items():
+        population = np.random.default_rng(0).uniform(0.0, 1.0, (size, len(FAULTS)))
+        _, cpu = _medians(partial(model.costs, population, SEARCH_CAP), repeats)
+        took.append(cpu / size)
+        yield name, took[-1] * 1e3, "ms", f"{took[-1] * 1e9 / experiment.ticks:.3g} ns a tick"
+    yield "blocks faster than one alone", took[-1] / took[-2], "times", ""
 
 
 def _estimate(case: BenchCase) -> Iterator[Figure]:
-    """From samples to interval, wall and CPU time by stage; the file is read before."""
-    times = max(1, case.repeats // 3)
-    result = identify([reference_experiment()])
+    """From samples to interval; the file is read before."""
     recording, samples = _recording(OPEN)
-    walls, cpus, stages = [], [], []
-    for _ in range(times):
-        wall, cpu = time.perf_counter(), time.process_time()  # the search has its own thread
-        item = build_experiment(
-            samples, recording.environment, resolve_test("open"), default_actuator()
+
+    def estimated() -> Identification:
+        test = resolve_test("open")
+        return identify(
+            [build_experiment(samples, recording.environment, test, default_actuator())]
         )
-        prepared = time.perf_counter() - wall
-        timing = identify([item]).timing
-        walls.append(time.perf_counter() - wall)
-        cpus.append(time.process_time() - cpu)
-        stages.append((prepared, timing.first, timing.search, timing.refine))
+
+    result, times = estimated(), case.repeats // 3
+    wall, cpu = _medians(estimated, times)
     remark = f"{result.evaluations} runs of the model, {result.attempts} attempt(s)"
-    yield "samples to estimate and interval, wall", statistics.median(walls) * 1e3, "ms", remark
-    yield "samples to estimate and interval, CPU", statistics.median(cpus) * 1e3, "ms", OPEN
-    names = ("prepare", "first approximation", "genetic search", "refinement and interval")
-    for name, value in zip(names, np.median(stages, axis=0), strict=True):
-        yield f"{name}, wall", float(value) * 1e3, "ms", "part of it"
-    healthy, spent = reference_experiment(HEALTHY), []
-    for _ in range(times):
-        cpu = time.process_time()
-        identify([healthy])
-        spent.append(time.process_time() - cpu)
-    yield "a healthy actuator in closed loop, CPU", statistics.median(spent) * 1e3, "ms", HEALTHY
-    error = max(abs(e.value - true) for e, true in zip(result.estimates, TRUTH, strict=True))
-    yield "largest error of the three constants", 100.0 * error, "%", ""
+    yield "samples to estimate and interval, wall", wall * 1e3, "ms", remark
+    yield "samples to estimate and interval, CPU", cpu * 1e3, "ms", OPEN
+    _, cpu = _medians(partial(identify, [reference_experiment(HEALTHY)]), times)
+    yield "a healthy actuator in closed loop, CPU", cpu * 1e3, "ms", HEALTHY
 
 
 def _push(case: BenchCase) -> Iterator[Figure]:
@@ -176,21 +157,18 @@ def _push(case: BenchCase) -> Iterator[Figure]:
     recording, s = _recording(OPEN)
     rows = zip(s.command, s.current, s.spool, s.pressure, s.position, strict=True)
     ticks = [Tick(*map(float, row)) for row in rows]
-    monitor = Monitor(default_actuator(), TRUTH, recording.environment)
+    monitor = Monitor(default_actuator(), (0.3, 0.6, 0.3), recording.environment)
     yield from _latencies("push, back to back", _push_ticks(monitor, ticks, 40 * len(ticks), 0))
     if case.seconds > 0.0:
-        count, found = max(1, round(case.seconds * 1e3)), []
-        thread = threading.Thread(
-            target=lambda: found.append(_push_ticks(monitor, ticks, count, 1_000_000))
-        )
+        count = max(1, round(case.seconds * 1e3))
         item, diagnoses = reference_experiment(), 0
-        thread.start()
-        while thread.is_alive():
-            identify([item])
-            diagnoses += 1
-        thread.join()
+        with ThreadPoolExecutor(1) as thread:
+            pushed = thread.submit(_push_ticks, monitor, ticks, count, 1_000_000)
+            while not pushed.done():
+                identify([item])
+                diagnoses += 1
         remark = f"{count} pushes at 1 kHz, {diagnoses} diagnoses meanwhile"
-        yield from _latencies("push while another thread diagnoses", found[0], remark)
+        yield from _latencies("push while another thread diagnoses", pushed.result(), remark)
 
 
 def _push_ticks(
@@ -213,30 +191,40 @@ def _push_ticks(
 
 
 def _latencies(name: str, latency: NDArray[np.int64], remark: str = "") -> Iterator[Figure]:
-    for label, share in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9), ("largest", 100.0)):
-        yield f"{name}, {label}", float(np.percentile(latency, share)) / 1e3, "µs", remark
+    for label, value in zip(
+        ("p50", "p99", "p99.9", "largest"), percentiles(latency / 1e3), strict=True
+    ):
+        yield f"{name}, {label}", value, "µs", remark
+
+
+def percentiles(values: NDArray[np.floating]) -> list[float]:
+    """Values that half, 99 and 99.9 % do not exceed, and the largest."""
+    found: list[float] = np.percentile(values, (50.0, 99.0, 99.9, 100.0)).tolist()
+    return found
 
 
 def _decode(case: BenchCase) -> Iterator[Figure]:
     """Reading and bulk decoding of long recordings."""
     short, bus_map = read_frames(LOGS / f"{OPEN}.blf"), default_map()
-    table, repeats = tiled(short, case.frames), max(1, case.repeats // 5)
-    unit = "million frames/s"
-    rate = len(table) / _cpu_median(lambda: decode(table, bus_map), repeats) / 1e6
-    yield "decode in bulk", rate, unit, f"{len(table)} frames"
-    begin = time.thread_time()
-    found = assemble(table, bus_map, "tiled", ())
-    rate = len(table) / (time.thread_time() - begin) / 1e6
-    yield "decode, find tests and align", rate, unit, f"{len(found)} recordings"
+    table, written = tiled(short, case.frames), tiled(short, min(60_000, case.frames))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.blf"
-        written = tiled(short, min(60_000, case.frames))
-        _write(written, path)
-        own = _cpu_median(lambda: read_frames(path), repeats)
-        theirs = _cpu_median(lambda: _read_with_python_can(path), repeats)
-    yield "read BLF into columns", len(written) / own / 1e6, unit, ""
-    yield "python-can reads the same", len(written) / theirs / 1e6, unit, ""
-    yield "faster than python-can's reader", theirs / own, "times", ""
+        with Recorder(path) as recorder, ReplayTransport(written, "tiled") as source:
+            while (frame := source.receive(0.0)) is not None:
+                recorder.write(frame)
+        reading: dict[str, tuple[int, Callable[[], object]]] = {
+            "decode in bulk": (len(table), lambda: decode(table, bus_map)),
+            "decode, find tests and align": (
+                len(table), lambda: assemble(table, bus_map, "tiled", ()),
+            ),
+            "read BLF into columns": (len(written), lambda: read_frames(path)),
+            "python-can reads the same": (len(written), lambda: _read_with_python_can(path)),
+        }  # fmt: skip
+        took = []
+        for name, (frames, work) in reading.items():
+            took.append(_medians(work, case.repeats // 5)[1])
+            yield name, frames / took[-1] / 1e6, "million frames/s", f"{frames} frames"
+    yield "faster than python-can's reader", took[-1] / took[-2], "times", ""
 
 
 def tiled(table: FrameTable, frames: int) -> FrameTable:
@@ -246,19 +234,6 @@ def tiled(table: FrameTable, frames: int) -> FrameTable:
     names = ("can_id", "length", "data", "extended", "fd", "error", "remote", "sent", "channel")
     columns = {name: getattr(table, name)[row] for name in names}
     return replace(table, time_ns=table.time_ns[row] + copy * span, **columns)
-
-
-def _write(table: FrameTable, path: Path) -> None:
-    with can.BLFWriter(path) as writer:
-        for k in range(len(table)):
-            writer.on_message_received(
-                can.Message(
-                    timestamp=float(table.time_ns[k]) * 1e-9,
-                    arbitration_id=int(table.can_id[k]),
-                    data=table.data[k, : table.length[k]].tobytes(),
-                    is_extended_id=bool(table.extended[k]),
-                )
-            )
 
 
 def _read_with_python_can(path: Path) -> int:
@@ -279,15 +254,14 @@ def _live(case: BenchCase) -> Iterator[Figure]:
     for source, sink in ((left[0], right[0]), (right[0], left[0])):
         threading.Thread(target=_carry, args=(source, sink), daemon=True).start()
     worn = ("--Kintas", "0.3", "--FSS", "0.6", "--FDJ", "0.3")
-    for test, label, faults in (
-        ("open", "", worn), ("closed", "", worn), ("closed", ", healthy actuator", ()),
-    ):  # fmt: skip
+    for test, faults in (("open", worn), ("closed", worn), ("closed", ())):
         with tempfile.TemporaryDirectory() as folder, _computer(os.ttyname(left[1]), faults):
             port = os.ttyname(right[1])
             runs = [_bit(test, port, folder) for _ in range(max(1, case.repeats // 5))]
         delays = [item for item in runs if item is not None]
         value = statistics.median(delays) * 1e3 if delays else None
-        name = f"last frame of a live test ({test}{label}) to verdict"
+        unit = "" if faults else ", healthy actuator"
+        name = f"last frame of a live test ({test}{unit}) to verdict"
         yield name, value, "ms", f"median of {len(delays)} tests; wall time"
 
 
@@ -297,11 +271,8 @@ def _bit(test: str, port: str, folder: str) -> float | None:
         [*COMMAND, "bit", "--test", test, "--port", port, "--json", "--out", folder],
         capture_output=True, text=True, check=False, timeout=TIMEOUT_S,
     )  # fmt: skip
-    try:
-        result = json.loads(done.stdout)
-    except ValueError:
-        return None
-    tested = result["verdict"] != "NOT_TESTED"
+    result = json.loads(done.stdout or "{}")
+    tested = result.get("verdict", NOT_TESTED) != NOT_TESTED
     return float(result["timing_s"]["after_test"]) if tested else None
 
 
@@ -332,7 +303,7 @@ def _carry(source: int, sink: int) -> None:
 WATCH = """
 import os, subprocess, sys, time
 begin = time.perf_counter()
-child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
+child = subprocess.Popen(sys.argv[2:], stdout=open(sys.argv[1], "wb"))
 _, status, usage = os.wait4(child.pid, 0)
 wall = time.perf_counter() - begin
 child.returncode = os.waitstatus_to_exitcode(status)
@@ -341,37 +312,50 @@ print(child.returncode, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss)
 """Measures one process. It is small itself: a child starts with its parent's peak of memory."""
 
 
-def _process(case: BenchCase) -> Iterator[Figure]:
-    """Processes from start to end: `ehadiag diagnose`, first ever and with its kernels cached."""
-    diagnose, times = ("diagnose", str(LOGS / f"{OPEN}.blf")), max(1, case.repeats // 3)
-    with tempfile.TemporaryDirectory() as folder:
-        first_wall, first_cpu, _ = _measured(diagnose, folder)
-        wall, cpu, _ = np.median([_measured(diagnose, folder) for _ in range(times)], axis=0)
-        peak = max(_measured(diagnose, folder)[2] for _ in range(times))
-        helps = np.median([_measured(("--help",), folder) for _ in range(times)], axis=0)
-        size = sum(item.stat().st_size for item in Path(folder).glob("kernels-*/*")) / 2**20
-    yield "help, wall", float(helps[0]), "s", ""
-    yield "diagnose one log, kernels cached, wall", float(wall), "s", OPEN
-    yield "diagnose one log, kernels cached, CPU", float(cpu), "s", ""
-    yield "diagnose one log, peak memory", peak, "MB", ""
-    yield "first run ever, wall", first_wall, "s", ""
-    yield "first run ever, CPU", first_cpu, "s", ""
-    yield "kernels in the cache", size, "MB", ""
-
-
-def _measured(arguments: Sequence[str], cache: str) -> tuple[float, float, float]:
-    """Wall and CPU time (s), peak memory (MB) of a process."""
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", WATCH, *COMMAND, *arguments],
-        env={**os.environ, "EHADIAG_CACHE_DIR": cache},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    code, wall, cpu, peak = done.stdout.split()
-    if int(code) not in (0, 10, 20):
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise InputOutputError(f"ehadiag {arguments[0]} ended with {code}: {last}")
+def _measured(words: Sequence[str], out: str = os.devnull) -> tuple[float, float, float, float]:
+    """Wall and CPU time (s) of `ehadiag` with those it starts; its peak memory, theirs together."""
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-S", "-c", WATCH, out, *COMMAND, *words],
+            stdout=subprocess.PIPE, stderr=errors, text=True,
+        )  # fmt: skip
+        together = 0.0
+        while process.poll() is None:
+            together = max(together, _memory_of_children(process.pid))
+            time.sleep(POLL_S)
+        errors.seek(0)
+        code, wall, cpu, peak = process.communicate()[0].split()
+        if int(code) not in (0, 10, 20):
+            raise InputOutputError(f"ehadiag {words[0]} ended with {code}: {errors.read().strip()}")
     per_mb = 1 << 20 if sys.platform == "darwin" else 1 << 10
-    return float(wall), float(cpu), float(peak) / per_mb
+    return float(wall), float(cpu), float(peak) / per_mb, together
+
+
+def _memory_of_children(pid: int) -> float:
+    """Memory, MB, of what a process has started."""
+    together = 0
+    with suppress(psutil.Error):
+        for item in psutil.Process(pid).children(recursive=True):
+            with suppress(psutil.Error):
+                together += item.memory_info().rss
+    return together / 2**20
+
+
+def _spent(name: str, words: Sequence[str], repeats: int) -> Iterator[Figure]:
+    """Median figures of a process, after one that fills the caches."""
+    _measured(words)
+    runs = [_measured(words) for _ in range(max(1, repeats))]
+    wall, cpu, peak, _ = np.median(runs, axis=0).tolist()
+    yield f"{name}, wall", wall, "s", ""
+    yield f"{name}, CPU", cpu, "s", ""
+    yield f"{name}, peak memory", peak, "MB", ""
+
+
+def _process(case: BenchCase) -> Iterator[Figure]:
+    """Processes from start to end."""
+    yield from _spent("help", ("--help",), case.repeats // 3)
+    log = str(LOGS / f"{OPEN}.blf")
+    yield from _spent("diagnose one log", ("diagnose", log), case.repeats // 3)
 
 
 SIMULATED = 40
@@ -382,18 +366,20 @@ POLL_S = 0.1
 
 def _batch(case: BenchCase) -> Iterator[Figure]:
     """A folder of recordings, by one process and by two."""
-    logs = prepare(Path(case.folder), case.recordings, case.seed)
-    walls, count = [], len(logs)
-    for jobs in (1, 2):
-        wall, processor, memory, results = _diagnosed_folder(logs[0].parent, jobs)
+    logs = prepare(case.folder, case.recordings, case.seed)
+    folder, count, walls = logs[0].parent, len(logs), []
+    out = folder.with_suffix(".jsonl")
+    words = ("diagnose", "--json", "--no-history", "--no-picture", str(folder), "--jobs")
+    for jobs in ("1", "2"):
+        wall, cpu, _, memory = _measured((*words, jobs), str(out))
         walls.append(wall)
+        results = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
         if [item["source"] for item in results] != [str(log) for log in logs]:
             raise InputOutputError("a result is missing, comes twice or out of order")
-        verdicts = Counter(str(item["verdict"]) for item in results)
-        name = f"{count} recordings, {jobs} {'job' if jobs == 1 else 'jobs'}"
-        yield f"{name}, wall", wall, "s", ", ".join(f"{n} {v}" for v, n in sorted(verdicts.items()))
+        name = f"{count} recordings, --jobs {jobs}"
+        yield f"{name}, wall", wall, "s", ""
         yield f"{name}, rate", count / wall, "recordings/s", ""
-        yield f"{name}, CPU of all processes", processor, "s", ""
+        yield f"{name}, CPU of all processes", cpu, "s", ""
         yield f"{name}, peak memory of all processes", memory, "MB", ""
     yield "two jobs faster than one", walls[0] / walls[1], "times", ""
 
@@ -417,47 +403,13 @@ def prepare(folder: Path, count: int, seed: int, simulated: int = SIMULATED) -> 
 def _simulate(log: Path, number: int, seed: int) -> None:
     severities = np.random.default_rng([seed, number]).uniform(0.0, 0.9, 3).round(3)
     words = ["bit", "--test", ("open", "closed")[number % 2], "--simulate", "--fast", "--plain"]
-    for name, value in zip(("Kintas", "FSS", "FDJ"), severities.tolist(), strict=True):
+    for name, value in zip(FAULT_NAMES, severities.tolist(), strict=True):
         words += [f"--{name}", str(value)]
     partly = log.with_name(f"partly-{log.name}")
     words += ["--simulator-seed", str(seed + number), "--record", str(partly)]
     words += ["--out", str(log.parent / "bit"), "--no-history", "--no-picture"]
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        main(words)
+    subprocess.run([*COMMAND, *words], capture_output=True, check=False, timeout=TIMEOUT_S)
     partly.rename(log)
-
-
-def _diagnosed_folder(folder: Path, jobs: int) -> tuple[float, float, float, list[Record]]:
-    """Wall and CPU time (s), memory (MB) of all processes together, results."""
-    # Files and not pipes: a pipe that nobody reads would hold the call up.
-    out, errors = (folder.with_name(f"{folder.name}.{end}") for end in ("jsonl", "log"))
-    words = ("diagnose", "--json", "--no-history", "--no-picture", str(folder), "--jobs", str(jobs))
-    begin = time.perf_counter()
-    with out.open("wb") as stdout, errors.open("wb") as stderr:
-        process = subprocess.Popen([*COMMAND, *words], stdout=stdout, stderr=stderr)
-        spent: dict[int, float] = {}
-        memory = 0.0
-        while process.poll() is None:
-            memory = max(memory, _usage(process.pid, spent))
-            time.sleep(POLL_S)
-    wall = time.perf_counter() - begin
-    if not out.stat().st_size:
-        raise InputOutputError(errors.read_text(encoding="utf-8", errors="replace"))
-    results = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
-    return wall, sum(spent.values()), memory, results
-
-
-def _usage(pid: int, spent: dict[int, float]) -> float:
-    """Memory, MB, of a process and those that it has started; `spent`: their processor time, s."""
-    together = 0
-    with suppress(psutil.Error):
-        root = psutil.Process(pid)
-        for item in (root, *root.children(recursive=True)):
-            with suppress(psutil.Error):
-                times = item.cpu_times()
-                spent[item.pid] = times.user + times.system
-                together += item.memory_info().rss
-    return together / 2**20
 
 
 DIAGNOSES = 50
@@ -468,7 +420,6 @@ UNIT = ("--unit", "7")
 QUESTIONS = {
     "one row": ("show", "301"),
     "list of one unit": ("list", *UNIT),
-    "picture of one unit": ("plot", *UNIT),
     "export of one unit": ("export", *UNIT),
 }
 """Words behind `ehadiag history` by question."""
@@ -476,22 +427,17 @@ QUESTIONS = {
 
 def _history(case: BenchCase) -> Iterator[Figure]:
     """Questions to a health history of many diagnoses, each a process from start to end."""
-    path = Path(case.folder) / f"{case.diagnoses}.sqlite"
+    path = case.folder / f"{case.diagnoses}.sqlite"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         _fill(path, case.diagnoses, case.seed)
     yield f"history of {case.diagnoses} diagnoses", path.stat().st_size / 1e6, "MB", ""
-    commands = {name: ("history", *words) for name, words in QUESTIONS.items()}
-    commands["picture of one unit"] += ("--out", str(path.with_suffix(".png")))
-    for name, words in (commands | {"remaining life of one unit": ("rul", *UNIT)}).items():
-        with tempfile.TemporaryDirectory() as cache:
-            command = (*words, "--history", str(path))
-            _measured(command, cache)  # fills the caches of the system
-            runs = [_measured(command, cache) for _ in range(3)]
-        wall, processor, peak = np.median(runs, axis=0).tolist()
-        yield f"{name}, wall", wall, "s", ""
-        yield f"{name}, CPU", processor, "s", ""
-        yield f"{name}, peak memory", peak, "MB", ""
+    store = ("--history", str(path))
+    for name, words in QUESTIONS.items():
+        yield from _spent(name, ("history", *words, *store), 3)
+    picture = ("history", "plot", *UNIT, *store, "--out", str(path.with_suffix(".png")))
+    yield from _spent("picture of one unit", picture, 3)
+    yield from _spent("remaining life of one unit", ("rul", *UNIT, *store), 3)
 
 
 def _fill(path: Path, count: int, seed: int) -> None:
@@ -502,46 +448,43 @@ def _fill(path: Path, count: int, seed: int) -> None:
     part = path.with_suffix(".part")
     part.unlink(missing_ok=True)
     with History(part, create=True) as history:
-        for first in range(0, count, UNITS * DIAGNOSES):
-            number = min(UNITS * DIAGNOSES, count - first)
-            history.append_all(list(_block(like, first // DIAGNOSES, number, rng)))
+        serials = range(1, count // DIAGNOSES + 1)
+        for first in range(0, len(serials), UNITS):
+            history.append_all(list(_block(like, serials[first : first + UNITS], rng)))
     part.rename(path)
 
 
-def _block(like: Entry, unit: int, number: int, rng: np.random.Generator) -> Iterator[Entry]:
+def _block(like: Entry, serials: range, rng: np.random.Generator) -> Iterator[Entry]:
+    """Diagnoses of some units, one of each unit after the other."""
     tree = json.loads(like.result)
-    rates = rng.uniform(0.3, 1.0, (UNITS, len(like.severities))) / DIAGNOSES
-    for visit in range(DIAGNOSES):
-        for place in range(number // DIAGNOSES):
-            noise = rng.normal(0.0, 2e-4, len(like.severities))
-            values = np.clip(rates[place] * (visit + 1) + noise, 0.0, 1.0).tolist()
-            serial, hours = unit + place + 1, 100.0 * (visit + 1)
-            yield replace(
-                like,
-                serial=serial,
-                usage=Usage(hours),
-                tested=f"{2000 + visit // 12}-{visit % 12 + 1:02}-01T12:00:00.000Z",
-                sources=tuple(
-                    replace(item, samples=f"{serial}-{visit}", sha256=None) for item in like.sources
-                ),
-                severities=tuple(
-                    Severity(name=item.name, estimate=value, std=2e-4,
-                             interval95=(max(value - 4e-4, 0.0), min(value + 4e-4, 1.0)))
-                    for item, value in zip(like.severities, values, strict=True)
-                ),
-                result=json.dumps(tree | {"serial": serial}),
-            )  # fmt: skip
+    rates = rng.uniform(0.3, 1.0, (len(serials), len(like.severities))) / DIAGNOSES
+    (source,) = like.sources
+    for visit, place in itertools.product(range(1, DIAGNOSES + 1), range(len(serials))):
+        values = rates[place] * visit + rng.normal(0.0, 2e-4, len(like.severities))
+        points = np.clip([values - 4e-4, values, values + 4e-4], 0.0, 1.0).T.tolist()
+        serial = serials[place]
+        yield replace(
+            like,
+            serial=serial,
+            usage=Usage(100.0 * visit),
+            tested=f"{2000 + visit // 12}-{visit % 12 + 1:02}-01T12:00:00.000Z",
+            sources=(replace(source, samples=f"{serial}-{visit}", sha256=None),),
+            severities=tuple(
+                replace(item, estimate=value, std=2e-4, interval95=(low, high))
+                for item, (low, value, high) in zip(like.severities, points, strict=True)
+            ),
+            result=json.dumps(tree | {"serial": serial}),
+        )
 
 
 def _machine() -> str:
-    """Processor, its cores that this process may use, and how busy they are."""
-    model, cpuinfo = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        model = next(iter(names), model)
-    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    return f"{model}, {os.cpu_count()} cores{load}; Python {platform.python_version()}"
+    """Processor, its cores, and how busy they are."""
+    cpuinfo = Path("/proc/cpuinfo")
+    found = re.search(r"model name\s*: (.*)", cpuinfo.read_text() if cpuinfo.exists() else "")
+    model = found[1] if found else platform.processor() or platform.machine()
+    load, _, _ = psutil.getloadavg()
+    version = platform.python_version()
+    return f"{model}, {os.cpu_count()} cores, load {load:.1f}; Python {version}"
 
 
 SECTIONS: dict[str, Callable[[BenchCase], Iterator[Figure]]] = {
@@ -569,13 +512,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _cases(options: Options) -> list[BenchCase]:
-    return [
-        BenchCase(
-            name, max(1, options.repeats), options.seconds, max(1, options.frames),
-            options.recordings, options.diagnoses, str(options.folder), options.seed,
-        )
-        for name in options.only or list(SECTIONS)[:-2]
-    ]  # fmt: skip
+    names = options.only or list(SECTIONS)[:-2]
+    return [case_of(BenchCase, options, section=name) for name in names]
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:

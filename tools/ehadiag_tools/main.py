@@ -14,7 +14,7 @@ from ehadiag_tools.free_motion.motion import FREE_MOTION
 from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
 from ehadiag_tools.prognosis.units import PROGNOSIS
 from ehadiag_tools.rigs.replay import DAQ_RECORDINGS, FOREIGN_BUSES
-from ehadiag_tools.simulator.compare_logs import RECORDINGS
+from ehadiag_tools.simulator.units import RECORDINGS
 from ehadiag_tools.soak import SOAK
 from ehadiag_tools.study import Study, run_study
 
@@ -28,14 +28,15 @@ STUDIES: tuple[Study[Any], ...] = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Perform the study that the command line names; return the exit code."""
     parser = argparse.ArgumentParser(prog="study", description=__doc__)
-    parser.add_argument("--list", action="store_true", help="list the studies")
+    parser.add_argument("--list", action="store_true", help="list the studies, as without a name")
     named = parser.add_subparsers(dest="name", metavar="NAME")
     for item in STUDIES:
-        item.add_arguments(named.add_parser(item.name, help=item.summary, description=item.summary))
+        own = named.add_parser(item.name, help=item.summary, description=item.summary)
+        item.add_arguments(own)
+        own.set_defaults(study=item)
     options = parser.parse_args(arguments)
+    if options.name is not None:
+        return run_study(options.study, options)
     for item in STUDIES:
-        if options.list or options.name is None:
-            print(f"{item.name:16} {item.summary}")
-        elif item.name == options.name:
-            return run_study(item, options)
+        print(f"{item.name:16} {item.summary}")
     return 0

@@ -28,8 +28,8 @@ from ehadiag.identify.identification_session import identify
 from ehadiag.monitor.streaming import Monitor
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.simulation import Plant
-from ehadiag_tools.bench import reference_experiment
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.bench import percentiles, reference_experiment
+from ehadiag_tools.study import Options, Record, Study, case_of, markdown
 from firmware_iface.codec import Encoder
 from firmware_iface.errors import BusLostError, ConfigurationError
 from firmware_iface.live_decode import LiveTicks
@@ -49,8 +49,8 @@ FRAME_S = 130e-6
 """Length of an 8-byte frame at 1 Mbit/s, stuff bits included, s."""
 OWN_LOAD = 2e9 / PERIOD_NS * FRAME_S
 """Load of the bus by telemetry and command, 1."""
-AGE_STEP_US, AGE_BINS = 10, 1_000_000
-"""Step of the histogram of ages, µs, and its length; older ones than ten seconds count as such."""
+ROOM = 60_000
+"""Number of times kept beyond those expected."""
 SILENCE_S, START_S = 1.0, 120.0
 """Silence after which the bus is empty, s, and longest time until the first frame."""
 FAULTS = (0.3, 0.3, 0.3)
@@ -59,13 +59,13 @@ FAULTS = (0.3, 0.3, 0.3)
 
 @dataclass(frozen=True, slots=True)
 class SoakCase:
-    """Bus as python-can names it, length in s, load as a share, whether diagnoses run."""
+    """Bus as python-can names it, length, load as a share, whether diagnoses run."""
 
     interface: str
     channel: str | None
-    seconds: float
+    minutes: float
     load: float
-    diagnose: bool = False
+    diagnose: bool
 
 
 def soak(case: SoakCase) -> Record:
@@ -73,13 +73,14 @@ def soak(case: SoakCase) -> Record:
 
     Frames sent, received (all senders together), lost, and of them those that the socket had no
     room for (None if it cannot say) or the reader was too slow for; memory of the reader after a
-    minute (or half the time) and at the end, bytes; ages of foreign frames when it has them, s; of
-    the monitor ticks pushed, lost on the way, alarms, rms of the residuals over the noise, and
-    times of a push and of all work of the receive thread on a tick: p50, p99, p99.9, largest.
+    minute (or half the time) and at the end, bytes; ages of foreign frames when it has them, µs; of
+    the monitor ticks pushed, alarms, rms of the residuals over the noise, and times of a push and
+    of all work of the receive thread on a tick, µs.
     """
-    if not (OWN_LOAD < case.load <= 1.0 and case.seconds >= 1.0):
+    seconds = 60.0 * case.minutes
+    if not (OWN_LOAD < case.load <= 1.0 and seconds >= 1.0):
         raise ConfigurationError(
-            f"soak of {case.seconds:g} s at load {case.load:g}: need at least 1 s, and a load "
+            f"soak of {seconds:g} s at load {case.load:g}: need at least 1 s, and a load "
             f"between {OWN_LOAD:.2f} (our own frames) and 1"
         )
     options = BusOptions(case.interface, channel=case.channel)
@@ -96,13 +97,13 @@ def soak(case: SoakCase) -> Record:
         PythonCanTransport(options) as bus,
         Recorder(Path(folder) / "soak.blf", max_bytes=64 << 20) as recorder,
     ):
-        sink = _Sink(recorder, case.seconds)
+        sink = _Sink(recorder, seconds)
         with Receiver(bus, sink=sink.take, idle=recorder.idle) as source:
-            reader = _Reader(source)
+            reader = _Reader(source, seconds * rate)
             for item in senders:
                 item.start()
             try:
-                reader.read(case.seconds, case.diagnose)
+                reader.read(seconds, case.diagnose)
             finally:
                 stop.set()
                 for item in senders:
@@ -123,7 +124,7 @@ def soak(case: SoakCase) -> Record:
         "recorded": recorder.frames,
         "rss_warm": reader.rss_warm,
         "rss_end": _resident(),
-        **reader.ages(),
+        "age_us": percentiles(reader.ages_us[: reader.foreign]),
         "diagnoses": reader.diagnoses,
         **sink.result(),
     }
@@ -135,7 +136,7 @@ class _Sink:
     def __init__(self, recorder: Recorder, seconds: float) -> None:
         self._recorder, self._ticks = recorder, LiveTicks()
         self._monitor = Monitor(default_actuator(), FAULTS, mode=CommandMode.POSITION)
-        room = round(seconds * 1e9 / PERIOD_NS) + 60_000
+        room = round(seconds * 1e9 / PERIOD_NS) + ROOM
         self._push, self._work = np.ones((2, room), dtype=np.int64)  # taken from the system now
         self._squares, self._count = np.zeros(2), np.zeros(2)
         self._breaks = self._alarms = self._pushes = 0
@@ -164,25 +165,23 @@ class _Sink:
         part = slice(min(self._pushes, len(self._push)))
         if not self._pushes:
             raise BusLostError("no tick arrived complete")
-        shares = (50.0, 99.0, 99.9, 100.0)
         return {
             "pushes": self._pushes,
-            "ticks_lost": self._ticks.lost,
             "alarms": self._alarms,
-            "push_us": (np.percentile(self._push[part], shares) / 1e3).tolist(),
-            "work_us": (np.percentile(self._work[part], shares) / 1e3).tolist(),
+            "push_us": percentiles(self._push[part] / 1e3),
+            "work_us": percentiles(self._work[part] / 1e3),
             "residual": np.sqrt(self._squares / np.maximum(self._count, 1.0)).tolist(),
         }
 
 
 class _Reader:
-    """Counts frames behind the queue, and their ages in a histogram of fixed size."""
+    """Counts frames behind the queue, and keeps the ages of foreign ones, as many as expected."""
 
-    def __init__(self, source: Receiver) -> None:
+    def __init__(self, source: Receiver, foreign: float) -> None:
         self._source = source
-        self._ages = np.ones(AGE_BINS, dtype=np.int64)  # written, so that memory is taken now
-        self._ages[:] = 0
-        self.own = self.foreign = self.oldest_us = self.rss_warm = self.diagnoses = self.before = 0
+        # Written, so that memory is taken now.
+        self.ages_us = np.ones(round(foreign) + ROOM, dtype=np.float32)
+        self.own = self.foreign = self.rss_warm = self.diagnoses = self.before = 0
         self.elapsed = 0.0
 
     def read(self, seconds: float, diagnose: bool) -> None:
@@ -207,15 +206,6 @@ class _Reader:
             if not self.rss_warm and self.elapsed >= warm:
                 self.rss_warm = _resident()
 
-    def ages(self) -> Record:
-        """Ages that half and 99 % of the foreign frames do not exceed, and the largest, s."""
-        total = np.cumsum(self._ages)
-        p50, p99 = (
-            float((np.searchsorted(total, share * total[-1]) + 1) * AGE_STEP_US * 1e-6)
-            for share in (0.5, 0.99)
-        )
-        return {"age_p50": p50, "age_p99": p99, "age_max": self.oldest_us * 1e-6}
-
     def take_all(self, timeout: float) -> bool:
         """Wait for a frame, then take those that are there; false after a silence."""
         frame = self._source.receive(timeout)
@@ -231,10 +221,9 @@ class _Reader:
         if frame.can_id < FOREIGN:
             self.own += 1
             return
+        age_us = time.monotonic_ns() // 1000 - int.from_bytes(frame.data[:6], "little")
+        self.ages_us[self.foreign % len(self.ages_us)] = age_us
         self.foreign += 1
-        age = time.monotonic_ns() // 1000 - int.from_bytes(frame.data[:6], "little")
-        self._ages[min(age // AGE_STEP_US, AGE_BINS - 1)] += 1
-        self.oldest_us = max(self.oldest_us, age)
 
 
 def _resident() -> int:
@@ -299,17 +288,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _cases(options: Options) -> list[SoakCase]:
-    bus = options.interface, options.channel
-    return [SoakCase(*bus, options.minutes * 60.0, options.load, options.diagnose)]
+    return [case_of(SoakCase, options)]
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    """Figures of each bus; percentiles are p50, p99, p99.9 and the largest."""
-    for item in records:
-        yield f"{item['interface']}, {item['seconds']:.0f} s at {item['load']:.0%} of 1 Mbit/s\n"
-        settings = SoakCase.__dataclass_fields__
-        rows = ((key, _text(value)) for key, value in item.items() if key not in settings)
-        yield from markdown(("figure", "value"), rows)
+    """Settings and figures; percentiles are p50, p99, p99.9 and the largest."""
+    (record,) = records
+    yield from markdown(("figure", "value"), ((name, _text(of)) for name, of in record.items()))
 
 
 def _text(value: object) -> str:

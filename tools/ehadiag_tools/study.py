@@ -13,15 +13,14 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib import resources
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 from rich.progress import track
 
@@ -125,44 +124,32 @@ def perform_cases(
     pending = {key: case for key, case in zip(keys, cases, strict=True) if key not in done}
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
+    with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1):
+        # One thread each: the workers already fill the cores.
+        performed = Parallel(batch_size=1, return_as="generator_unordered")(
+            delayed(_performed)(study.perform, key, case) for key, case in pending.items()
+        )
     # On stderr, so that reports can be redirected; only where someone sees it.
     console = Console(file=sys.stderr)
-    performed = track(
-        _performed(study.perform, pending, jobs), study.name, total=len(cases),
+    shown = track(
+        performed, study.name, total=len(cases),
         completed=len(cases) - len(pending), console=console, transient=True,
         disable=not console.is_terminal,
     )  # fmt: skip
     with open(kept or os.devnull, "a", encoding="utf-8") as file:
         # A line cut short must not swallow the next one.
         file.write("\n" if done else "")
-        for key, found in performed:
+        for key, found in shown:
             # Through JSON, so that a record is the same before and after a resumption.
-            line = json.dumps({**asdict(pending[key]), **found})
+            line = json.dumps({**asdict(pending[key]), **found}, default=str)
             done[key] = json.loads(line)
             file.write(f'{{"key": "{key}", {line[1:]}\n')
             file.flush()
     return [done[key] for key in keys]
 
 
-def _performed(
-    perform: Callable[[C], Record], pending: dict[str, C], jobs: int
-) -> Iterator[tuple[str, Record]]:
-    if jobs == 1 or len(pending) < 2:
-        for key, case in pending.items():
-            yield key, perform(case)
-        return
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        # The workers inherit it: one thread each, they already fill the cores.
-        os.environ.setdefault(name, "1")
-    # "spawn": a fork of a process that shows progress in a thread may hang.
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(perform, case): key for key, case in pending.items()}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+def _performed(perform: Callable[[C], Record], key: str, case: C) -> tuple[str, Record]:
+    return key, perform(case)
 
 
 def case_key(study: str, case: DataclassInstance) -> str:
@@ -188,6 +175,12 @@ def _read(path: Path) -> dict[str, Record]:
                 record = json.loads(line)
                 found[record.pop("key")] = record
     return found
+
+
+def case_of(kind: type[C], options: Options, **own: Any) -> C:
+    """Case of a study: its own settings, the others are the options of their names."""
+    names = {item.name for item in fields(kind)} - own.keys()
+    return kind(**{name: getattr(options, name) for name in names}, **own)
 
 
 def grouped(records: Iterable[Record], *names: str) -> dict[tuple[Any, ...], list[Record]]:

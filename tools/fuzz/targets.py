@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import IntFlag, auto
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -26,9 +27,9 @@ import numpy as np
 from ehadiag.core.actuator import default_actuator, load_actuator
 from firmware_iface import bus_map as busmap
 from firmware_iface.alignment.align import assemble, windowed_recordings
-from firmware_iface.bus_map import BusMap, default_map, load_map
+from firmware_iface.bus_map import default_map, load_map
 from firmware_iface.codec import Decoded, DecodedTable, decode
-from firmware_iface.dbc import parse_dbc
+from firmware_iface.dbc import Dbc, parse_dbc
 from firmware_iface.errors import EhadiagError
 from firmware_iface.files import decode_toml
 from firmware_iface.find_test import CandidateTests
@@ -74,6 +75,9 @@ BUDGET = Budget(frames=100_000, size=1 << 20)
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 """In memory where the system has such a folder: a file is written for every input."""
 MOST_TICKS = 256
+BUS = default_map()
+CANDIDATES = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
+MEANING = Interpretation(BUS, None, CANDIDATES)
 
 
 class Flags(IntFlag):
@@ -88,38 +92,34 @@ class Flags(IntFlag):
 
 def target(name: str, share: int = 1) -> Callable[[bytes], None]:
     """Return the function that takes one input; one in `share` goes all the way."""
-    return TARGETS[name](share)
-
-
-def _chosen(data: bytes, share: int) -> bool:
-    return zlib.crc32(data) % share == 0
-
-
-def _frames(share: int) -> Callable[[bytes], None]:
-    bus = default_map()
 
     def check(data: bytes) -> None:
-        frames = _frames_of(data)
-        decoder, live = LiveDecoder(bus), LiveTicks(bus, CommandMode.CURRENT)
-        answers = [decoder.decode(frame) for frame in frames]
-        given = [len(live.take(frame)) for frame in frames]
-        if max(given, default=0) > MOST_TICKS:
-            raise AssertionError("one frame completes more ticks than a turn of the counter has")
-        samples = sum(_is_telemetry(frame, bus) for frame in frames)
-        if not live.lost <= sum(given) <= live.lost + samples:
-            raise AssertionError("ticks were made up or kept back")
-        if frames and _chosen(data, share):
-            table = FrameTable.from_frames(frames)
-            _compare(answers, decode(table, bus), bus, len(set(table.channel.tolist()) - {0}) > 1)
-            with contextlib.suppress(EhadiagError):
-                assemble(table, bus, "fuzz")
+        if data:
+            TARGETS[name](data, zlib.crc32(data) % share == 0)
 
     return check
 
 
-def _is_telemetry(frame: Frame, bus: BusMap) -> bool:
+def _frames(data: bytes, all_the_way: bool) -> None:
+    frames = _frames_of(data)
+    decoder, live = LiveDecoder(BUS), LiveTicks(BUS, CommandMode.CURRENT)
+    answers = [decoder.decode(frame) for frame in frames]
+    given = [len(live.take(frame)) for frame in frames]
+    if max(given, default=0) > MOST_TICKS:
+        raise AssertionError("one frame completes more ticks than a turn of the counter has")
+    samples = sum(_is_telemetry(frame) for frame in frames)
+    if not live.lost <= sum(given) <= live.lost + samples:
+        raise AssertionError("ticks were made up or kept back")
+    if frames and all_the_way:
+        table = FrameTable.from_frames(frames)
+        _compare(answers, decode(table, BUS), len(set(table.channel.tolist()) - {0}) > 1)
+        with contextlib.suppress(EhadiagError):
+            assemble(table, BUS, "fuzz")
+
+
+def _is_telemetry(frame: Frame) -> bool:
     """Whether a frame could complete a tick."""
-    message = next(item for item in bus.messages.values() if item.measures)
+    message = next(item for item in BUS.messages.values() if item.measures)
     mine = (frame.can_id, frame.extended) == (message.can_id, message.extended)
     return mine and not frame.error and not frame.remote and intact(message, frame.data)
 
@@ -127,7 +127,6 @@ def _is_telemetry(frame: Frame, bus: BusMap) -> bool:
 def _compare(
     answers: list[BitStatus | Sample | BitRequest | None],
     decoded: DecodedTable,
-    bus: BusMap,
     several_channels: bool,
 ) -> None:
     """One frame at a time and in columns, the same frames are good and say the same.
@@ -136,13 +135,13 @@ def _compare(
     """
     roles = {Sample: "channels.spool", BitRequest: "request.code", BitStatus: "status.state"}
     for kind, role in roles.items():
-        found = bus.find(role)
+        found = BUS.find(role)
         if found is None:
             raise AssertionError(f"the default bus has no {role}")
         item = decoded.messages[found[0].name]
         rows = item.row
         if kind is BitStatus:
-            rows = rows[np.isin(item.values[role], list(bus.states))]
+            rows = rows[np.isin(item.values[role], list(BUS.states))]
         live_rows = [row for row, answer in enumerate(answers) if type(answer) is kind]
         if not set(live_rows) <= set(rows.tolist()):
             raise AssertionError(f"{found[0].name}: the decoders accept different frames")
@@ -195,65 +194,48 @@ def _frames_of(data: bytes) -> list[Frame]:
     return frames
 
 
-def _windows(_: int) -> Callable[[bytes], None]:
+def _windows(data: bytes, _: bool) -> None:
     """The same frames in windows as small as can be: none larger than allowed, none without end."""
-    bus = default_map()
-
-    def check(data: bytes) -> None:
-        frames = _frames_of(data)
-        if not frames:
-            return
-        held = 20 + data[0]
-        tables = [FrameTable.from_frames(frames[at : at + 10]) for at in range(0, len(frames), 10)]
-        found = list(windowed_recordings(tables, bus, "fuzz", held, least=20))
-        if not found:
-            raise AssertionError("no recording at all")
-        if any(item.quality.total("received") > min(len(frames), held + 10) for item in found):
-            raise AssertionError("a test has more frames than a window")
-        best = choose_recording(found)
-        if best.samples is None and any(item.samples is not None for item in found):
-            raise AssertionError("a test was passed over for nothing")
-
-    return check
+    frames = _frames_of(data)
+    if not frames:
+        return
+    held = 20 + data[0]
+    tables = [FrameTable.from_frames(frames[at : at + 10]) for at in range(0, len(frames), 10)]
+    found = list(windowed_recordings(tables, BUS, "fuzz", held, least=20))
+    if not found:
+        raise AssertionError("no recording at all")
+    if any(item.quality.total("received") > min(len(frames), held + 10) for item in found):
+        raise AssertionError("a test has more frames than a window")
+    best = choose_recording(found)
+    if best.samples is None and any(item.samples is not None for item in found):
+        raise AssertionError("a test was passed over for nothing")
 
 
-def _serial(_: int) -> Callable[[bytes], None]:
-    def check(data: bytes) -> None:
-        whole = Framer()
-        frames = whole.feed(data)
-        pieces = Framer()
-        cut = 1 + (data[0] if data else 0) % 40
-        found = []
-        for at in range(0, len(data), cut):
-            found += pieces.feed(data[at : at + cut])
-            if len(pieces._partial) > MAX_CODED_BYTES:
-                raise AssertionError("the framer keeps more than a packet")
-        if (found, pieces.bad, pieces.bytes_seen) != (frames, whole.bad, whole.bytes_seen):
-            raise AssertionError("the framer depends on how the bytes come")
-        for frame in frames:
-            again = Framer().feed(packet_of(frame))
-            if len(again) != 1 or (again[0].can_id, again[0].data) != (frame.can_id, frame.data):
-                raise AssertionError("a frame does not survive its own packet")
-
-    return check
+def _serial(data: bytes, _: bool) -> None:
+    whole, pieces = Framer(), Framer()
+    frames, found = whole.feed(data), []
+    cut = 1 + data[0] % 40
+    for at in range(0, len(data), cut):
+        found += pieces.feed(data[at : at + cut])
+        if len(pieces._partial) > MAX_CODED_BYTES:
+            raise AssertionError("the framer keeps more than a packet")
+    if (found, pieces.bad, pieces.bytes_seen) != (frames, whole.bad, whole.bytes_seen):
+        raise AssertionError("the framer depends on how the bytes come")
+    for frame in frames:
+        again = Framer().feed(packet_of(frame))
+        if len(again) != 1 or (again[0].can_id, again[0].data) != (frame.can_id, frame.data):
+            raise AssertionError("a frame does not survive its own packet")
 
 
-def _logs(share: int) -> Callable[[bytes], None]:
-    bus = default_map()
-
-    def check(data: bytes) -> None:
-        if not data:
-            return
-        kind, content = KINDS[data[0] % len(KINDS)], data[1:]
-        if kind == "container":
-            kind, content = ".blf", _blf_around(content)
-        with _file(kind, content) as name, contextlib.suppress(EhadiagError):
-            if _chosen(data, share):
-                read_recordings(name, bus)
-            else:
-                read_frames(name)
-
-    return check
+def _logs(data: bytes, all_the_way: bool) -> None:
+    kind, content = KINDS[data[0] % len(KINDS)], data[1:]
+    if kind == "container":
+        kind, content = ".blf", _blf_around(content)
+    with _file(kind, content) as name, contextlib.suppress(EhadiagError):
+        if all_the_way:
+            read_recordings(name, BUS)
+        else:
+            read_frames(name)
 
 
 def _blf_around(content: bytes) -> bytes:
@@ -267,53 +249,38 @@ def _blf_around(content: bytes) -> bytes:
     return header + start + CONTAINER_HEADER.pack(0, len(content)) + content
 
 
-def _mappings(_: int) -> Callable[[bytes], None]:
+@cache
+def _default_mapping() -> tuple[MappingFile, Dbc]:
+    """Parsed once: ten milliseconds for the same answer would be nearly all of the time."""
+    files = resources.files("firmware_iface").joinpath("data")
+    mapping = decode_toml(files.joinpath("eha_fcc.toml").read_bytes(), MappingFile, "default")
+    return mapping, parse_dbc(files.joinpath("eha_fcc.dbc").read_bytes(), "default")
+
+
+def _mappings(data: bytes, _: bool) -> None:
     """First byte even: a mapping against the default DBC; odd: a DBC for the default mapping."""
-    data_files = resources.files("firmware_iface").joinpath("data")
-    mapping = decode_toml(data_files.joinpath("eha_fcc.toml").read_bytes(), MappingFile, "default")
-    # Ten milliseconds for the same answer every time would be nearly all of the time.
-    default = parse_dbc(data_files.joinpath("eha_fcc.dbc").read_bytes(), "default")
-
-    def check(data: bytes) -> None:
-        if not data:
-            return
-        with contextlib.suppress(EhadiagError):
-            if data[0] % 2:
-                busmap.resolve(mapping, parse_dbc(data[1:], "fuzz"), "fuzz", "fuzz")
-            else:
-                tree = decode_toml(data[1:], MappingFile, "fuzz")
-                busmap.resolve(tree, default, "fuzz", "fuzz")
-
-    return check
+    mapping, dbc = _default_mapping()
+    with contextlib.suppress(EhadiagError):
+        if data[0] % 2:
+            dbc = parse_dbc(data[1:], "fuzz")
+        else:
+            mapping = decode_toml(data[1:], MappingFile, "fuzz")
+        busmap.resolve(mapping, dbc, "fuzz", "fuzz")
 
 
-def _signals(_: int) -> Callable[[bytes], None]:
+def _signals(data: bytes, _: bool) -> None:
     """Recordings that are not binary logs, to their tests."""
-    candidates = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
-    meaning = Interpretation(default_map(), None, candidates)
-
-    def check(data: bytes) -> None:
-        if not data:
-            return
-        kind, content = SIGNALS[data[0] % len(SIGNALS)], data[1:]
-        if kind.startswith("packed"):
-            kind, content = kind.removeprefix("packed"), gzip.compress(content, 1)
-        with _file(kind, content) as path, contextlib.suppress(EhadiagError):
-            list(recorded_tests([path], meaning, BUDGET))
-
-    return check
+    kind, content = SIGNALS[data[0] % len(SIGNALS)], data[1:]
+    if kind.startswith("packed"):
+        kind, content = kind.removeprefix("packed"), gzip.compress(content, 1)
+    with _file(kind, content) as path, contextlib.suppress(EhadiagError):
+        list(recorded_tests([path], MEANING, BUDGET))
 
 
-def _configurations(_: int) -> Callable[[bytes], None]:
+def _configurations(data: bytes, _: bool) -> None:
     """Actuator files, test files, mappings of columns, mappings of frames that name a DBC."""
-
-    def check(data: bytes) -> None:
-        if not data:
-            return
-        with _file(".toml", data[1:]) as path, contextlib.suppress(EhadiagError):
-            CONFIGURATIONS[data[0] % len(CONFIGURATIONS)](path)
-
-    return check
+    with _file(".toml", data[1:]) as path, contextlib.suppress(EhadiagError):
+        CONFIGURATIONS[data[0] % len(CONFIGURATIONS)](path)
 
 
 @contextmanager
@@ -326,7 +293,7 @@ def _file(suffix: str, content: bytes) -> Iterator[str]:
         Path(file.name).unlink()
 
 
-TARGETS: Mapping[str, Callable[[int], Callable[[bytes], None]]] = {
+TARGETS: Mapping[str, Callable[[bytes, bool], None]] = {
     "frames": _frames,
     "windows": _windows,
     "serial": _serial,

@@ -13,6 +13,7 @@ from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.prior import ParameterPrior
 from ehadiag.identify.ring import Ring, find_ring, is_same_ring, ring_prior
+from ehadiag.model.plant import slip_speed
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
 from firmware_iface.stored_test import bundled_tests, resolve_test
@@ -97,7 +98,7 @@ def missing(actuator, name, begin, end):
     test = resolve_test(name)
     recording = simulate(actuator, test, step=1e-6).recording("simulated")
     experiment = build_experiment(recording.samples, recording.environment, test, actuator)
-    left = np.isnan(experiment.sliding(experiment.slip_speed()).pressure)
+    left = np.isnan(experiment.sliding(slip_speed(experiment.constants)).pressure)
     return float(left[round(1e3 * begin) : round(1e3 * end)].mean())
 
 
@@ -116,7 +117,7 @@ def test_a_worn_jack_slips_at_more():
         recording.samples, recording.environment, test, with_volume(0.9e-4)
     )
     c = experiment.constants
-    ratio = experiment.slip_speed(0.5) / experiment.slip_speed()
+    ratio = slip_speed(experiment.constants, 0.5) / slip_speed(experiment.constants)
     assert ratio == pytest.approx((c.FDJ + 0.5 * (c.FDJ1 - c.FDJ)) / c.FDJ)
 
 
@@ -161,7 +162,7 @@ def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
     recording = done.recording("simulated")
     assert recording.samples is not None
     experiment = build_experiment(recording.samples, recording.environment, test, unit)
-    slow = np.isnan(experiment.sliding(experiment.slip_speed(worn.FDJ)).pressure)
+    slow = np.isnan(experiment.sliding(slip_speed(experiment.constants, worn.FDJ)).pressure)
     assert 0.3 < slow.mean() < 0.95
     ticks = np.arange(len(slow))
     ring = 4e5 * np.sin(2.0 * np.pi * 0.083 * ticks + np.cumsum(ticks % 50 == 0))
@@ -169,7 +170,7 @@ def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
     samples = replace(recording.samples, pressure=pressure)
     found = diagnose([replace(recording, samples=samples)], unit, bundled_tests().values())
     assert found.identification is not None
-    slips = experiment.slip_speed(worn.FDJ)
+    slips = slip_speed(experiment.constants, worn.FDJ)
     assert found.identification.slip_speed == pytest.approx(slips, rel=0.3)
     assert found.identification.named("FDJ").value == pytest.approx(0.6, abs=0.01)
     assert found.verdict is Verdict.DEGRADED

@@ -1,4 +1,4 @@
-"""compare_logs: the simulator, driven by a recording's currents, reproduces the recording."""
+"""Replay: the simulator, driven by a recording's currents, reproduces the recording."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,7 @@ from ehadiag import bundled_tests, default_actuator
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
 from ehadiag_tools.main import main
-from ehadiag_tools.simulator import compare_logs
-from ehadiag_tools.simulator.compare_logs import replay
+from ehadiag_tools.simulator.units import effects_of, replay, residuals
 from firmware_iface.recording import Environment
 
 ACTUATOR = default_actuator()
@@ -52,20 +51,18 @@ def test_replay_bridges_lost_rows(run):
 
 
 def test_residual_is_the_noise_floor(run):
-    gap = compare_logs.residuals(ACTUATOR, run.samples, run.command, FAULTS, Effects(), STEP)
+    gap = residuals(ACTUATOR, run.samples, run.command, FAULTS, Effects(), STEP)
     np.testing.assert_allclose(np.sqrt((gap**2).mean(axis=1)), FLOOR, rtol=0.03)
 
 
 def test_residual_shows_other_faults(run):
-    gap = compare_logs.residuals(
-        ACTUATOR, run.samples, run.command, Faults(0.5, 0.3, 0.4), Effects(), STEP
-    )
+    gap = residuals(ACTUATOR, run.samples, run.command, Faults(0.5, 0.3, 0.4), Effects(), STEP)
     assert np.sqrt((gap[1:3] ** 2).mean(axis=1)).min() > 1.1 * FLOOR
 
 
 def test_environment_becomes_effects():
-    assert compare_logs.effects_of(Environment()) == Effects()
-    known = compare_logs.effects_of(Environment(20.1e6, 0.6e6, 85.0))
+    assert effects_of(Environment()) == Effects()
+    known = effects_of(Environment(20.1e6, 0.6e6, 85.0))
     assert (known.supply_pressure, known.return_pressure) == (20.1e6, 0.6e6)
     assert known.oil_temperature == 85.0
 

@@ -42,22 +42,22 @@ from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S
 from ehadiag_sim.simulation import simulate
 from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, cramer_rao, percent_errors
-from ehadiag_tools.simulator.compare_logs import read_truth
 from ehadiag_tools.simulator.units import (
     COARSE_STEP,
     Unit,
     add_group,
     damaged_unit,
+    read_tested,
+    read_truth,
     record,
     unit_with,
 )
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
-from firmware_iface.errors import ConfigurationError, InputOutputError
+from firmware_iface.errors import ConfigurationError
 from firmware_iface.recording import CHANNELS, Environment, Recording, Samples
-from firmware_iface.signals.recordings import read_recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
-Severities = tuple[float, float, float]
+Severities = tuple[float, ...]
 """Kintas, FSS, FDJ, each 0 … 1."""
 SURFACE_PERIOD = 4
 """Random cases for one on the surface of the cube, until each of its parts was visited."""
@@ -107,19 +107,18 @@ def random_faults(count: int, seed: int) -> list[Severities]:
     Among them, one in four, are all corners, a point on each edge and on each face: 26 in all.
     """
     rng = np.random.default_rng(seed)
-    surface: list[list[float]] = []
+    surface: list[Severities] = []
     faces: tuple[float | None, ...] = (0.0, 1.0, None)
     for place in itertools.product(faces, repeat=3):
         if place != (None, None, None):
-            free = rng.random(3)
-            surface.append([float(r) if v is None else v for v, r in zip(place, free, strict=True)])
+            free = rng.random(3).tolist()
+            surface.append(tuple(r if v is None else v for v, r in zip(place, free, strict=True)))
     order = iter(rng.permutation(len(surface)))
     out: list[Severities] = []
     for index in range(count):
-        inside = rng.random(3)
+        inside = tuple(rng.random(3).tolist())
         special = next(order, None) if index % SURFACE_PERIOD == 0 else None
-        a, b, c = inside if special is None else surface[special]
-        out.append((float(a), float(b), float(c)))
+        out.append(inside if special is None else surface[special])
     return out
 
 
@@ -204,10 +203,8 @@ def experiments_of(case: Case) -> list[Experiment]:
 
 @lru_cache(maxsize=8)
 def _recorded(path: str) -> tuple[Samples, Environment]:
-    recording = read_recording(Path(path))
-    if recording.samples is None:
-        raise InputOutputError(f"log {path}: no telemetry of a test in it")
-    return recording.samples, recording.environment
+    recording, samples = read_tested(Path(path))
+    return samples, recording.environment
 
 
 @lru_cache(maxsize=8)
@@ -264,15 +261,13 @@ def _paper_cases(options: Options) -> list[Case]:
             for case in PAPER
             for seed in seeds
         ]
-    truth = options.recordings / "truth.csv"
     found = [
-        Case(row.test, (row.faults.Kintas, row.faults.FSS, row.faults.FDJ),
-             recordings=(str(options.recordings / row.file),))
-        for row in read_truth(truth)
-        if row.test in TITLES
-    ]  # fmt: skip
+        Case(truth.test, truth.faults, recordings=(truth.path,))
+        for truth in read_truth(options.recordings)
+        if truth.test in TITLES
+    ]
     if not found:
-        raise ConfigurationError(f"{truth}: no recording of {', '.join(TITLES)}")
+        raise ConfigurationError(f"{options.recordings}: no recording of {', '.join(TITLES)}")
     return found
 
 

@@ -21,7 +21,7 @@ from ehadiag.model.registry import FAULTS, Unknowns
 from ehadiag.report.response_signals import sensed_response
 from ehadiag.terminal.live_view import draw_snapshot
 from ehadiag_sim.conditions import Faults
-from ehadiag_tools.study import Options, Record, Study
+from ehadiag_tools.study import Options, Record, Study, case_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73")
 """Okabe and Ito's, which colour-blind people tell apart; the dashes differ too."""
@@ -36,17 +36,17 @@ class PictureCase:
     """One picture by its name, and the folder for it."""
 
     picture: str
-    folder: str
+    folder: Path
 
 
 def draw_method(case: PictureCase) -> Record:
     """Draw a picture of the method."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     METHOD_PICTURES[case.picture](figure)
-    path = Path(case.folder) / f"method-{case.picture}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    case.folder.mkdir(parents=True, exist_ok=True)
+    path = case.folder / f"method-{case.picture}.png"
     figure.savefig(path, dpi=100)
-    return {"path": str(path)}
+    return {"path": path}
 
 
 TIME, CURRENT, SPOOL, JACK = "time, s", "current, mA", "spool position, mm", "jack position, mm"
@@ -187,8 +187,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _cases(options: Options) -> list[PictureCase]:
-    names = list(METHOD_PICTURES) if options.only is None else [options.only]
-    return [PictureCase(name, str(options.folder)) for name in names]
+    names = [options.only] if options.only else METHOD_PICTURES
+    return [case_of(PictureCase, options, picture=name) for name in names]
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:

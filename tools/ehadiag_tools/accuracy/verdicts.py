@@ -43,12 +43,12 @@ from ehadiag_tools.accuracy.figures import (
     outcome,
     percent_errors,
 )
-from ehadiag_tools.simulator.compare_logs import read_rows
 from ehadiag_tools.simulator.units import (
     COARSE_STEP,
     Unit,
     add_group,
     random_unit,
+    read_truth,
     record,
     unit_with,
 )
@@ -237,15 +237,14 @@ def perform_recorded(case: RecordedUnit) -> Record:
     sheet = folder / f"sheet-{case.unit}.toml"
     new: list[Recording] = []
     worn: list[Worn] = []
-    for row in read_rows(folder / "truth.csv", "file", *FAULT_NAMES):
-        if row["file"].startswith(f"{case.unit}-"):
-            recording = read_recording(folder / row["file"])
-            truth = [float(row[name]) for name in FAULT_NAMES]
-            about = {"recording": Path(row["file"]).stem, "faults": truth}
-            if "-new-" in row["file"]:
+    for truth in read_truth(folder):
+        name = Path(truth.path).stem
+        if name.startswith(f"{case.unit}-"):
+            recording = read_recording(Path(truth.path))
+            if "-new-" in name:
                 new.append(recording)
             else:
-                worn.append((about, recording))
+                worn.append(({"recording": name, "faults": truth.faults}, recording))
     actuator = load_actuator(sheet) if sheet.exists() else default_actuator()
     statements = {str(said): said for said in case.exponents}
     return judged(new[: case.new or None], actuator, worn, statements, bounds=True)
@@ -262,11 +261,10 @@ def _recorded_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _recorded_cases(options: Options) -> list[RecordedUnit]:
-    truth = options.recordings / "truth.csv"
-    files = [row["file"] for row in read_rows(truth, "file", *FAULT_NAMES)]
+    files = [Path(truth.path).name for truth in read_truth(options.recordings)]
     names = dict.fromkeys(file.partition("-")[0] for file in files if "-new-" in file)
     if not names:
-        raise ConfigurationError(f"{truth}: no recording of a unit as new")
+        raise ConfigurationError(f"{options.recordings}/truth.csv: no recording of a unit as new")
     stated = tuple(tuple(given) if given[1:] else given[0] for given in options.exponent)
     return [RecordedUnit(str(options.recordings), name, options.new, stated) for name in names]
 

@@ -25,6 +25,7 @@ from ehadiag.compile.jit import Array, Array2, kernel
 from ehadiag.compile.vector import unpacker
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.conversion import actuator_channels
+from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.monitor.change_test import (
     CAUSES,
     PIECE_H,
@@ -38,7 +39,7 @@ from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.plant_dynamics import STATE, advance_plant
 from ehadiag_sim.plant_laws import PlantCoefficients, scale_unit_data, unit_condition, unit_data
 from ehadiag_tools.free_motion.commands import HELD_OUT, KINDS, even_in_octaves, random_command
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.recording import DEFAULT_SCALES, CommandMode, Environment
 
 ALL_KINDS = (*KINDS, *HELD_OUT)
@@ -68,7 +69,7 @@ class Motion:
     kind: str
     mode: str
     seconds: float
-    faults: tuple[float, float, float]
+    faults: tuple[float, ...]
     seed: int
     oil: float = 40.0
     """At the beginning, degC."""
@@ -177,7 +178,7 @@ def free_motion(actuator: Actuator, motion: Motion) -> MotionRecord:
         noise[changed * ENVIRONMENT_TICKS :, place] += motion.size / lsb[place]
     elif name in ("oil", "supply"):
         environment[changed:, int(name == "supply")] += motion.size
-    severities = dict(zip(("Kintas", "FSS", "FDJ"), motion.faults, strict=True))
+    severities = dict(zip(FAULT_NAMES, motion.faults, strict=True))
     worn = severities | ({name: severities[name] + motion.size} if name in severities else {})
     loads = 0.0, motion.size if name == "load" else 0.0
     data, conditions = unit_data(actuator), [
@@ -207,23 +208,17 @@ def random_motion(
     kinds: Sequence[str] = KINDS,
 ) -> Motion:
     """Piece of healthy motion: kinds and modes in turn, all else at random."""
-    a, b, c = rng.uniform(0.0, 0.7, 3).tolist()
     return Motion(
         kinds[number // 2 % len(kinds)],
         "position" if number % 2 else "current",
         seconds,
-        (a, b, c),
+        tuple(rng.uniform(0.0, 0.7, 3).tolist()),
         seed,
         oil=float(rng.uniform(*OIL)),
         oil_rate=float(rng.uniform(-0.05, 0.05)),
         ripple=float(rng.uniform(0.0, 0.3e6)),
         ripple_hz=even_in_octaves(rng, (0.1, 3.0)),
     )
-
-
-def changed(motion: Motion, change: str, size: float, after: float) -> Motion:
-    """The same piece with a change in it."""
-    return replace(motion, change=change, size=size, after=after)
 
 
 SEVERITY_ERROR = 0.003
@@ -342,61 +337,62 @@ def _changed(seed: int, turn: int, number: int, mode: int, kinds: Sequence[str])
     kind = (7 * turn + 3 * number + 5 * mode) % len(kinds)
     own = seed + 1000 * turn + 10 * number + mode
     motion = random_motion(rng, 2 * kind + mode, CHANGED_PIECE_S, own, kinds)
-    return changed(motion, *CHANGES[number], CHANGE_S)
+    change, size = CHANGES[number]
+    return replace(motion, change=change, size=size, after=CHANGE_S)
 
 
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
+    flat = [{**item["motion"], **item} for item in records]
     if options.calibrate:
-        yield from _calibration(records, options.hours)
+        yield from _calibration(flat, options.hours)
     elif options.changes:
-        yield from _changes(records)
+        yield from _changes(flat)
     elif options.severities:
-        yield from _severities(records)
+        yield from _severities(flat)
     else:
-        yield from _false_alarms(records, options)
-    spent = sum(item["processor_s"] for item in records)
-    hours = sum(item["motion"]["seconds"] for item in records) / 3600.0
+        yield from _false_alarms(flat, options)
+    spent = sum(item["processor_s"] for item in flat)
+    hours = _hours_of(flat)
     yield f"\nprocessor time {spent:.0f} s, {spent / hours:.0f} s an hour of motion"
 
 
+def _hours_of(records: Sequence[Record]) -> float:
+    return float(sum(item["seconds"] for item in records) / 3600.0)
+
+
 def _false_alarms(records: Sequence[Record], options: Options) -> Iterator[str]:
-    rows = []
-    for name in ("current", "position", "both"):
-        part = [item for item in records if name in ("both", item["motion"]["mode"])]
-        if part:
-            hours = sum(item["motion"]["seconds"] for item in part) / 3600.0
-            alarms = sum(len(item["alarms"]) for item in part)
-            low, high = garwood(alarms)
-            interval = f"{low / hours:.2f} … {high / hours:.2f}"
-            rows.append((name, f"{hours:.2f}", str(alarms), f"{alarms / hours:.2f}", interval))
     yield f"stated {1.0 / options.hours:.2f}/h, seed {options.seed}\n"
+    rows = []
+    for (mode,), part in (grouped(records, "mode") | {("both",): records}).items():
+        hours, alarms = _hours_of(part), sum(len(item["alarms"]) for item in part)
+        low, high = garwood(alarms)
+        interval = f"{low / hours:.2f} … {high / hours:.2f}"
+        rows.append((mode, f"{hours:.2f}", alarms, f"{alarms / hours:.2f}", interval))
     yield from markdown(("mode", "hours", "alarms", "an hour", "95 % interval"), rows)
     for item in records:
-        motion = item["motion"]
         for when, causes in item["alarms"]:
-            piece = f"seed {motion['seed']} {motion['kind']} {motion['mode']}"
+            piece = f"seed {item['seed']} {item['kind']} {item['mode']}"
             yield f"- {piece}: {when:.0f} s, {causes}"
 
 
 def _severities(records: Sequence[Record]) -> Iterator[str]:
     """How often severities are stated, and how near the truth; `grown` since their diagnosis."""
+    each = [
+        {"mode": item["mode"], "grown": item["grown"] > 0.0, "name": name,
+         "stated": item["severities"].get(name)}
+        for item in sorted(records, key=lambda item: (item["mode"], item["grown"]))
+        for name in FAULT_NAMES
+    ]  # fmt: skip
     rows = []
-    for mode, grown, name in itertools.product(
-        ("current", "position"), (False, True), ("Kintas", "FSS", "FDJ")
-    ):
-        part = [
-            item["severities"] for item in records
-            if item["motion"]["mode"] == mode and (item["grown"] > 0.0) == grown
-        ]  # fmt: skip
-        found = [item[name] for item in part if name in item]
+    for (mode, grown, name), part in grouped(each, "mode", "grown", "name").items():
+        found = [item["stated"] for item in part if item["stated"]]
         if found:
-            errors = np.array([value - truth for value, _, _, truth in found])
-            covered = sum(low <= truth <= high for _, _, (low, high), truth in found)
-            numbers = (np.sqrt(np.mean(errors**2)), np.abs(errors).max(),
-                       np.median([std for _, std, _, _ in found]))  # fmt: skip
+            value, std, (low, high), truth = (np.array(x).T for x in zip(*found, strict=True))
+            error, covered = value - truth, (low <= truth) & (truth <= high)
+            numbers = np.sqrt(np.mean(error**2)), np.abs(error).max(), np.median(std)
             rows.append((
                 mode, "grown" if grown else "as diagnosed", name, f"{len(found)} of {len(part)}",
-                f"{covered}", *(f"{value:.4f}" for value in numbers),
+                covered.sum(), *(f"{value:.4f}" for value in numbers),
             ))  # fmt: skip
     heads = ("mode", "unit", "severity", "stated", "covered", "rms error", "largest", "stated std")
     yield from markdown(heads, rows)
@@ -404,34 +400,23 @@ def _severities(records: Sequence[Record]) -> Iterator[str]:
 
 def _changes(records: Sequence[Record]) -> Iterator[str]:
     """Delays and names; a piece that alarms before its change counts as a false alarm."""
-    rows = []
-    counts = [0, 0, 0, 0]
-    for change, size in CHANGES:
-        for mode in ("current", "position"):
-            part = [
-                item for item in records
-                if (item["motion"]["change"], item["motion"]["size"], item["motion"]["mode"])
-                == (change, size, mode)
-            ]  # fmt: skip
-            delays, names = [], []
-            for item in part:
-                counts[0] += 1
-                after = [found for found in item["alarms"] if found[0] > CHANGE_S]
-                counts[3] += len(item["alarms"]) - len(after)
-                kind = item["motion"]["kind"]
-                delays.append(f"{after[0][0] - CHANGE_S:.0f} ({kind})" if after else f"- ({kind})")
-                if after:
-                    likely = [name for name, _, _ in after[0][1]]
-                    counts[1] += 1
-                    counts[2] += likely[0] == change
-                    names.append(" or ".join(likely))
-            cells = ", ".join(delays), "; ".join(names)
-            if part:
-                rows.append((change, f"{size:g}", mode, *cells))
+    rows, found, right, early = [], 0, 0, 0
+    for (change, size, mode), part in grouped(records, "change", "size", "mode").items():
+        delays, names = [], []
+        for item in part:
+            after = [alarm for alarm in item["alarms"] if alarm[0] > CHANGE_S]
+            early += len(item["alarms"]) - len(after)
+            delays.append(f"- ({item['kind']})")
+            if after:
+                when, causes = after[0]
+                likely = [name for name, _, _ in causes]
+                delays[-1] = f"{when - CHANGE_S:.0f} ({item['kind']})"
+                names.append(" or ".join(likely))
+                found, right = found + 1, right + (likely[0] == change)
+        rows.append((change, f"{size:g}", mode, ", ".join(delays), "; ".join(names)))
     yield from markdown(("change", "size", "mode", "found after, s (motion)", "named"), rows)
-    total, found, right, early = counts
     named = f"{right} of {found} with the right name first"
-    yield f"\n{found} of {total} found, {named}; {early} alarms before"
+    yield f"\n{found} of {len(records)} found, {named}; {early} alarms before"
 
 
 def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
@@ -445,7 +430,7 @@ def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
     for item in records:
         count = max(1, round(len(item["values"]) / looks))
         values += np.array_split(np.array(item["values"]), count)
-        kinds += [item["motion"]["kind"]] * count
+        kinds += [item["kind"]] * count
     spans, votes = _spreads(values)
     rows = [
         (BANK_NAMES[place], *(f"{value:.1f}" for value in column), f"{vote:.2f}")
@@ -456,7 +441,7 @@ def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
     location, scale = _tail(largest)
     yield f"\nlargest of each of {len(largest)} pieces: tail of {location:.2f}, {scale:.2f}"
     yield "largest of all: " + ", ".join(f"{value:.2f}" for value in np.sort(largest)[::-1][:10])
-    seen = sum(item["motion"]["seconds"] for item in records) / 3600.0
+    seen = _hours_of(records)
     for stated in (hours / 5.0, hours):
         alarms = 0
         for kind in set(kinds):

@@ -15,15 +15,15 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
 
 from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, MaintenanceEvent, SourceRecord, Usage
-from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.prognosis.averaging import CHANCES, Fleet, learn_fleet
 from ehadiag.prognosis.forecast import forecast
 from ehadiag.prognosis.lives import Life, lives_of
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, case_of, markdown
 
 Array = NDArray[np.float64]
 GRID_H, LONGEST_H = 2.0, 20_000.0
@@ -286,29 +286,11 @@ INTERVAL_H = (50.0, 150.0)
 """Shortest and longest time between two diagnoses, h."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Noise:
-    """Diagnoses with known truth, of one severity; shape (diagnoses,) each."""
-
-    truth: NDArray[np.float64]
-    error: NDArray[np.float64]
-    std: NDArray[np.float64]
-
-    def draw(self, severity: float, rng: np.random.Generator) -> tuple[float, float]:
-        """Return error and stated deviation of a diagnosis near a severity: one of the table's."""
-        near = np.argsort(np.abs(self.truth - severity))[:12]
-        index = int(rng.choice(near))
-        return float(self.error[index] * rng.choice((-1.0, 1.0))), float(self.std[index])
-
-
-def read_noise() -> dict[str, Noise]:
-    """Read the table, by severity."""
-    rows = np.genfromtxt(TABLE, delimiter=",", names=True, dtype=None, encoding="ascii")
-    each = {name: rows[rows["severity"] == name] for name in FAULT_NAMES}
-    return {
-        name: Noise(mine["truth"], mine["estimate"] - mine["truth"], mine["std"])
-        for name, mine in each.items()
-    }
+def read_noise() -> dict[str, pandas.DataFrame]:
+    """Truth, error and stated deviation of diagnoses, by severity."""
+    table = pandas.read_csv(TABLE)
+    table["error"] = table.estimate - table.truth
+    return {name: part.reset_index(drop=True) for name, part in table.groupby("severity")}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -326,7 +308,9 @@ class WornUnit:
     end: float
 
 
-def simulate_unit(law: str, serial: int, noise: dict[str, Noise], seed: int) -> WornUnit:
+def simulate_unit(
+    law: str, serial: int, noise: Mapping[str, pandas.DataFrame], seed: int
+) -> WornUnit:
     """Simulate a unit from new until a severity is at the limit in its last life.
 
     Units with a filter have it changed once or twice before; half of the events do not name what
@@ -348,12 +332,14 @@ def simulate_unit(law: str, serial: int, noise: dict[str, Noise], seed: int) -> 
             if gap < at < gap + age / 3.0:
                 at = gap + age / 3.0
                 continue
-            entries.append(_entry(serial, name, born + at, _level(path, at), noise[name], rng))
+            level = float(np.interp(at, HOURS, path))
+            entries.append(_entry(serial, name, born + at, level, noise[name], rng))
             at += rng.uniform(*INTERVAL_H)
         if number < changes:
             born += age
             resets = ("Kintas",) if rng.random() < 0.5 else ()
-            events.append(_event(serial, born, resets))
+            filter_change = ("filter changed", resets)
+            events.append(MaintenanceEvent("", "", serial, None, Usage(born), *filter_change))
     return WornUnit(law, name, tuple(entries), tuple(events), born, born + age)
 
 
@@ -367,15 +353,18 @@ def _crossing(path: Array, level: float) -> float:
     return (index + share) * GRID_H
 
 
-def _level(path: Array, age: float) -> float:
-    return float(np.interp(age, GRID_H * np.arange(1, len(path) + 1), path))
-
-
 def _entry(
-    serial: int, name: str, hours: float, level: float, noise: Noise, rng: np.random.Generator
+    serial: int,
+    name: str,
+    hours: float,
+    level: float,
+    noise: pandas.DataFrame,
+    rng: np.random.Generator,
 ) -> Entry:
-    error, std = noise.draw(level, rng)
-    value = min(max(level + error, 0.0), 1.0)
+    """Diagnosis with the error of one of the table's near this severity."""
+    place = rng.choice(np.argsort(np.abs(noise.truth.to_numpy() - level))[:12])
+    value = min(max(level + float(noise.error[place] * rng.choice((-1.0, 1.0))), 0.0), 1.0)
+    std = float(noise["std"][place])
     severity = Severity(
         name=name, estimate=value, std=std, interval95=(value - 2 * std, value + 2 * std)
     )
@@ -387,10 +376,11 @@ def _entry(
     )  # fmt: skip
 
 
-def _event(serial: int, hours: float, resets: tuple[str, ...]) -> MaintenanceEvent:
-    return MaintenanceEvent("", "", serial, None, Usage(hours), "filter changed", resets)
-
-
+FIGURES = {
+    "answered": "{:.1%}", "covered": "{:.3f}", "late": "{:.3f}", "score": "{:.4f}",
+    "alarms": "{:.1%}",
+}  # fmt: skip
+"""Figures of an answer, and how their means are printed."""
 SHARES = (0.3, 0.5, 0.7, 0.9)
 """Shares of the last life at which remaining life is forecast, 1."""
 SETS = {"tuned": tuple(TUNED), "held-out": tuple(HELD_OUT), "all": tuple(LAWS)}
@@ -415,10 +405,10 @@ class LifeCase:
 
 
 def perform(case: LifeCase) -> Record:
-    """Forecast a unit's remaining life at each of `SHARES`.
+    """Forecast a unit's remaining life at each of `SHARES`: figures of each answer.
 
-    Of each: the share, the true remaining life over the life's length, whether the check raised an
-    alarm, and the quantiles of the forecast; None where there is no number.
+    Whether there is a number, the true end within the interval of 80 % or before it, the score of
+    the quantiles over the life's length, and whether the check raised an alarm.
     """
     unit = simulate_unit(case.law, case.unit, read_noise(), case.seed)
     lives, fleet = _fleet(case.law, case.fleet, case.group, case.censored, case.seed)
@@ -431,13 +421,24 @@ def perform(case: LifeCase) -> Record:
         own = learn_fleet([*lives, *earlier], fleet.scale, case.seed) if earlier else fleet
         found = forecast(unit.name, "hours", life, own, (LIMIT,), case.seed)
         (left,) = found.remaining
-        numbers = None
+        figures: Record = {"share": share, "answered": 0.0, "alarms": float(bool(found.alarm))}
         if left.median is not None:
             quantiles = np.array(left.quantiles or [0.0] * len(CHANCES))
-            numbers = np.minimum(quantiles / length, LATEST).tolist()
-        true = (unit.end - life.born - life.age[-1]) / length
-        asked.append((share, true, bool(found.alarm), numbers))
+            quantiles = np.minimum(quantiles / length, LATEST)
+            true = (unit.end - life.born - life.age[-1]) / length
+            low, high = np.interp((0.1, 0.9), CHANCES, quantiles)
+            figures |= {
+                "answered": 1.0, "covered": float(low <= true <= high), "late": float(true < low),
+                "score": quantile_score(true, quantiles),
+            }  # fmt: skip
+        asked.append(figures)
     return {"asked": asked}
+
+
+def quantile_score(true: float, found: Array) -> float:
+    """Continuous ranked probability score by the quantiles: twice their mean pinball loss."""
+    off = true - found
+    return float(2.0 * np.mean(np.maximum(CHANCES * off, (CHANCES - 1.0) * off)))
 
 
 @lru_cache(maxsize=1)
@@ -465,13 +466,10 @@ def _lives_until(unit: WornUnit, share: float) -> tuple[Life, list[Life]]:
 
 def _cases(options: Options) -> list[LifeCase]:
     laws = SETS[options.laws]
-    each = -(-options.cases // len(laws))
     return [
-        LifeCase(
-            place, law, options.fleet, place // UNITS_PER_FLEET, options.censored, options.seed
-        )
+        case_of(LifeCase, options, law=law, unit=place, group=place // UNITS_PER_FLEET)
         for law in laws
-        for place in range(each)
+        for place in range(-(-options.cases // len(laws)))
     ]
 
 
@@ -484,38 +482,19 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     fleet = f"fleet of {options.fleet}{' taken out early' if options.censored else ''}"
     yield f"{len(records)} units, laws {options.laws}, seed {options.seed}, {fleet}\n"
-    rows: list[tuple[str, ...]] = [("all", *_cells(records))]
-    for law in SETS[options.laws]:
-        part = [item for item in records if item["law"] == law]
-        rows += [(law, *_cells(part))] if part else []
-    for share in SHARES:
-        rows.append((f"{share:.0%} of the life", *_cells(records, share)))
-    heads = ("", "questions", "answered", "covered", "too late", "score", "alarms")
-    yield from markdown(heads, rows)
-
-
-def _cells(records: Sequence[Record], share: float | None = None) -> tuple[str, ...]:
-    """Cells of the answers at a share of the life; None: at all of them."""
-    asked = [item for record in records for item in record["asked"] if share in (None, item[0])]
-    given = [(true, np.array(found)) for _, true, _, found in asked if found is not None]
-    if not given:
-        return (str(len(asked)), "0.0%", "–", "–", "–", "–")
-    ends = np.array([np.interp((0.1, 0.9), CHANCES, found) for _, found in given])
-    truth = np.array([true for true, _ in given])
-    covered = np.mean((ends[:, 0] <= truth) & (truth <= ends[:, 1]))
-    late = np.mean(truth < ends[:, 0])
-    score = np.mean([quantile_score(true, found) for true, found in given])
-    alarms = np.mean([alarm for _, _, alarm, _ in asked])
-    return (
-        str(len(asked)), f"{len(given) / len(asked):.1%}", f"{covered:.3f}", f"{late:.3f}",
-        f"{score:.4f}", f"{alarms:.1%}",
-    )  # fmt: skip
-
-
-def quantile_score(true: float, found: NDArray[np.float64]) -> float:
-    """Continuous ranked probability score by the quantiles: twice their mean pinball loss."""
-    off = true - found
-    return float(2.0 * np.mean(np.maximum(CHANCES * off, (CHANCES - 1.0) * off)))
+    asked = pandas.DataFrame(
+        [{"law": record["law"], **item} for record in records for item in record["asked"]],
+        columns=["law", "share", *FIGURES],
+    )
+    parts = [("all", asked), *asked.groupby("law", sort=False)]
+    parts += [(f"{share:.0%} of the life", part) for share, part in asked.groupby("share")]
+    yield from markdown(
+        ("", "questions", "answered", "covered", "too late", "score", "alarms"),
+        (
+            (name, len(part), *map(str.format, FIGURES.values(), part[[*FIGURES]].mean()))
+            for name, part in parts
+        ),
+    )
 
 
 PROGNOSIS = Study(

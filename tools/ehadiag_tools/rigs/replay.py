@@ -21,7 +21,6 @@ from scipy.interpolate import Akima1DInterpolator
 
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
-from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults, Sensors, UnmodelledEffects
 from ehadiag_sim.plant_dynamics import PlantDynamics
 from ehadiag_sim.plant_laws import PositionController
@@ -32,18 +31,17 @@ from ehadiag_tools.rigs.rerecord import (
     BUSES,
     TESTS,
     Disturbance,
-    ForeignBus,
     frames_on,
     logged,
     played,
     read_columns,
 )
-from ehadiag_tools.simulator.compare_logs import read_rows
+from ehadiag_tools.simulator.units import read_truth
 from ehadiag_tools.study import Options, Record, Study, grouped
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
 from firmware_iface.find_test import CandidateTests
-from firmware_iface.recording import CHANNELS, CommandMode, Recording, Samples
+from firmware_iface.recording import CHANNELS, CommandMode, Recording
 from firmware_iface.signals.recordings import choose_recording, read_recording
 from firmware_iface.stored_test import StoredTest, bundled_tests
 
@@ -64,7 +62,7 @@ class BusReplay:
     """
 
     recording: str
-    faults: tuple[float, float, float]
+    faults: tuple[float, ...]
     actuator: str
     bus: str
     how: Disturbance
@@ -86,59 +84,29 @@ def _judged(read: Callable[[], Recording], actuator: Actuator) -> Record:
 
 
 def _played(case: BusReplay, recording: Recording, actuator: Actuator) -> Recording:
+    """Play a recording as the case has it, and read it there as `diagnose` does."""
     if case.bus == DEFAULT:
         return recording
+    if recording.samples is None:
+        raise ValueError(f"{recording.source}: nothing to play")
     test = next(item for item in TESTS if item.id == recording.test_id)
+    this, name = played(recording.samples, as_sent(test), case.how.lead_in_s), case.recording
     if case.bus == DAQ:
-        return on_daq(recording, test, case.how, actuator, case.seed, case.rate)
-    return on_bus(BUSES[case.bus], recording, test, case.how, actuator, case.seed)
-
-
-@cache
-def _actuator(path: str) -> Actuator:
-    return load_actuator(Path(path)) if path else default_actuator()
-
-
-def on_bus(
-    bus: ForeignBus,
-    recording: Recording,
-    test: StoredTest,
-    how: Disturbance,
-    actuator: Actuator,
-    seed: int,
-) -> Recording:
-    """Play a recording on a bus, and read it there as a log of that bus is read."""
-    this = played(_samples_of(recording), as_sent(test), how.lead_in_s)
-    table, bus_map = frames_on(bus, recording, this, how, seed)
+        columns = logged(this, case.how, case.rate, recording.samples.period_ns, case.seed)
+        for probe in ("supply_pressure", "return_pressure", "oil_temperature"):
+            value = getattr(recording.environment, probe)
+            columns[probe] = np.full(len(columns["time"]), value)
+        return read_columns(columns, actuator, Path(name).stem)
+    table, bus_map = frames_on(BUSES[case.bus], recording, this, case.how, case.seed)
     candidates = CandidateTests(TESTS, actuator.controller)
-    name = f"{Path(recording.source).stem} on {bus.name}"
     return choose_recording(
         windowed_recordings([table], bus_map, name, len(table) + 1, candidates=candidates)
     )
 
 
-def on_daq(
-    recording: Recording,
-    test: StoredTest,
-    how: Disturbance,
-    actuator: Actuator,
-    seed: int,
-    rate: float,
-) -> Recording:
-    """Write a recording as a decoded CSV at a rate (Hz), and read it as `diagnose` does."""
-    samples = _samples_of(recording)
-    this = played(samples, as_sent(test), how.lead_in_s)
-    columns = logged(this, how, rate, samples.period_ns, seed)
-    around = recording.environment
-    for name in ("supply_pressure", "return_pressure", "oil_temperature"):
-        columns[name] = np.full(len(columns["time"]), getattr(around, name))
-    return read_columns(columns, actuator, Path(recording.source).stem)
-
-
-def _samples_of(recording: Recording) -> Samples:
-    if recording.samples is None:
-        raise ValueError(f"{recording.source}: nothing to play")
-    return recording.samples
+@cache
+def _actuator(path: str) -> Actuator:
+    return load_actuator(Path(path)) if path else default_actuator()
 
 
 def as_sent(test: StoredTest) -> NDArray[np.float64]:
@@ -170,18 +138,18 @@ def _cases(options: Options) -> list[BusReplay]:
 
 def _usual_cases(folder: Path, options: Options) -> Iterator[BusReplay]:
     """Recordings of a folder as they are; without those of units that are not calibrated."""
-    for row in read_rows(folder / "truth.csv", "file", *FAULT_NAMES):
-        path, actuator = folder / row["file"], ""
+    for truth in read_truth(folder):
+        path, actuator = Path(truth.path), ""
         if options.only and path.stem not in options.only:
             continue
-        if row.get("unit"):
-            unit = options.calibrated / f"{row['unit']}.toml" if options.calibrated else None
+        if truth.unit:
+            unit = options.calibrated / f"{truth.unit}.toml" if options.calibrated else None
             if unit is None or not unit.is_file() or "-new-" in path.name:
                 continue
             actuator = str(unit)
-        a, b, c = (float(row[name]) for name in FAULT_NAMES)
-        how = Disturbance()
-        yield BusReplay(str(path), (a, b, c), actuator, DEFAULT, how, options.rate, options.seed)
+        yield BusReplay(
+            truth.path, truth.faults, actuator, DEFAULT, Disturbance(), options.rate, options.seed
+        )
 
 
 def _foreign_cases(case: BusReplay, options: Options) -> Iterator[BusReplay]:
@@ -241,13 +209,13 @@ class DaqCase:
     """
 
     test: str
-    faults: tuple[float, float, float]
     rate: float
     bits: int
     with_command: bool
     lead_in_s: float
     phase: float
     drift_ppm: float
+    faults: tuple[float, ...]
     seed: int
 
 
@@ -318,21 +286,14 @@ def perform_daq(case: DaqCase) -> Record:
 
 def _daq_cases(options: Options) -> list[DaqCase]:
     """Each kind of recording in turn, with severities, phase and clock of its own."""
-    kinds = [
-        (test, rate, bits, with_command)
-        for test in ("closed", "open")
-        for rate in RATES
-        for bits in NOISE_STEPS
-        for with_command in (False, True)
-    ]
+    kinds = list(itertools.product(("closed", "open"), RATES, NOISE_STEPS, (False, True)))
     out = []
     for number in range(options.cases):
-        test, rate, bits, with_command = kinds[number % len(kinds)]
         rng = np.random.default_rng([options.seed, number])
-        a, b, c = rng.uniform(0.0, 0.9, 3).round(3).tolist()
+        faults = tuple(rng.uniform(0.0, 0.9, 3).round(3).tolist())
         lead_in, phase, drift = rng.uniform((0.0, 0.0, -100.0), (1.5, 1.0, 100.0)).round(3).tolist()
         seed = int(rng.integers(1 << 31))
-        out.append(DaqCase(test, (a, b, c), rate, bits, with_command, lead_in, phase, drift, seed))
+        out.append(DaqCase(*kinds[number % len(kinds)], lead_in, phase, drift, faults, seed))
     return out
 
 

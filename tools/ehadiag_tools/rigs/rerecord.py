@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas
 from cantools.database.can import Database
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, default_actuator
@@ -128,27 +129,49 @@ def frames_on(
 ) -> tuple[FrameTable, BusMap]:
     """Frames of a recording on a bus, in order of arrival, and what they mean."""
     bus_map, rng = bus.bus_map(), np.random.default_rng(seed)
-    tick_ns = default_map().tick_ns
-    schedule = bus.schedule()
-    sent: dict[str, list[tuple[float, bytes]]] = {name: [] for name in schedule}
-    encoder = _Encoder(bus_map, recording)
-    for tick in range(this.channels.shape[1]):
-        payloads = encoder.tick(this, tick)
-        for name, data in payloads.items():
-            every, at = schedule[name]
-            if tick % every == 0:
-                sent[name].append((tick + at, data))
+    tick_ns, schedule, encoder = default_map().tick_ns, bus.schedule(), TickEncoder(bus_map)
+    messages = {(item.can_id, item.extended): item for item in bus_map.messages.values()}
+    sent: dict[str, list[tuple[float, Frame]]] = {name: [] for name in schedule}
+    sections = {role.name.partition(".")[0] for item in messages.values() for role in item.roles}
+    for tick in range(len(this.command)):
+        lost = bool(np.isnan(this.channels[:, tick]).any())
+        _take_tick(encoder, sections - ({"channels"} if lost else set()), recording, this, tick)
+        for frame in encoder.frames(0):
+            message = messages[frame.can_id, frame.extended]
+            every, at = schedule[message.name]
+            # With a lost sample that shares its message a command is lost too.
+            if tick % every == 0 and not (lost and message.measures):
+                sent[message.name].append((tick + at, frame))
     rows: list[tuple[float, int, Frame]] = []
-    for name, items in sent.items():
-        message = bus_map.messages[name]
-        true = np.array([at for at, _ in items])
-        stamp = _stamps(true, how, tick_ns, rng)
-        for order, (late, (_, data)) in enumerate(zip(stamp, items, strict=True)):
+    for items in sent.values():
+        stamps = _stamps(np.array([at for at, _ in items]), how, tick_ns, rng)
+        for order, (late, (_, frame)) in enumerate(zip(stamps, items, strict=True)):
             time_ns = START_NS + round(late * (1.0 + how.drift_ppm * 1e-6) * tick_ns)
-            frame = Frame(time_ns, message.can_id, data, message.extended, message.fd)
-            rows.append((late, order, frame))
+            rows.append((late, order, replace(frame, time_ns=time_ns)))
     rows.sort(key=lambda row: row[:2])
     return FrameTable.from_frames(frame for _, _, frame in rows), bus_map
+
+
+def _take_tick(
+    encoder: TickEncoder, sections: set[str], recording: Recording, this: Played, tick: int
+) -> None:
+    """Give the encoder the values of a tick in these sections of the mapping."""
+    if "channels" in sections:
+        pairs = zip(CHANNELS, this.channels[:, tick], strict=True)
+        encoder.telemetry([int(item.encode(value)) for item, value in pairs], 0)
+    if "command" in sections:
+        encoder.command(this.mode, float(this.command[tick]), 0, 0)
+    if "environment" in sections:
+        known = recording.environment
+        probes = known.supply_pressure, known.return_pressure, known.oil_temperature
+        supply, back, oil = (value or 0.0 for value in probes)
+        encoder.environment(supply, back, oil, 0)
+    if "status" in sections:
+        begun = BitState.COMPLETE if tick >= this.end else BitState.RUNNING
+        state = begun if tick >= this.begin else BitState.IDLE
+        number = (recording.test_id or 0) * (tick >= this.begin)
+        elapsed = max(min(tick, this.end) - this.begin, 0) * 1e-3
+        encoder.status(state, 0, number, elapsed, recording.serial or 0, 0)
 
 
 def _stamps(
@@ -157,47 +180,6 @@ def _stamps(
     """Time stamps in ticks, of the instants at which frames were sent."""
     late = true + np.abs(rng.normal(0.0, how.jitter_ms * 1e6 / tick_ns, len(true)))
     return np.maximum.accumulate(late)
-
-
-class _Encoder:
-    """Payloads of each message in each tick."""
-
-    def __init__(self, bus_map: BusMap, recording: Recording) -> None:
-        self._encoder = TickEncoder(bus_map)
-        self._map = bus_map
-        self._recording = recording
-        messages = bus_map.messages.values()
-        self._names = {(item.can_id, item.extended): item.name for item in messages}
-        self._has = {
-            section: any(role.name.startswith(section) for item in messages for role in item.roles)
-            for section in ("command", "environment", "status")
-        }
-
-    def tick(self, this: Played, tick: int) -> dict[str, bytes]:
-        """Payload of each message."""
-        values = this.channels[:, tick]
-        lost = bool(np.isnan(values).any())
-        if not lost:
-            pairs = zip(CHANNELS, values, strict=True)
-            self._encoder.telemetry([int(item.encode(value)) for item, value in pairs], 0)
-        if self._has["command"]:
-            self._encoder.command(this.mode, float(this.command[tick]), 0, 0)
-        if self._has["environment"]:
-            known = self._recording.environment
-            probes = known.supply_pressure, known.return_pressure, known.oil_temperature
-            supply, back, oil = (value or 0.0 for value in probes)
-            self._encoder.environment(supply, back, oil, 0)
-        if self._has["status"]:
-            begun = BitState.COMPLETE if tick >= this.end else BitState.RUNNING
-            state = begun if tick >= this.begin else BitState.IDLE
-            number = (self._recording.test_id or 0) * (tick >= this.begin)
-            elapsed = max(min(tick, this.end) - this.begin, 0) * 1e-3
-            self._encoder.status(state, 0, number, elapsed, self._recording.serial or 0, 0)
-        frames = self._encoder.frames(0)
-        out = {self._names[frame.can_id, frame.extended]: frame.data for frame in frames}
-        # With a lost sample that shares its message a command is lost too.
-        gone = {name for name in out if lost and self._map.messages[name].measures}
-        return {name: data for name, data in out.items() if name not in gone}
 
 
 def logged(

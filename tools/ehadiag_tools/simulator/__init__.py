@@ -1,1 +1,1 @@
-"""Checks of the simulator: against recordings and a stiff reference solver."""
+"""Units and their recordings, by the detailed simulator."""
