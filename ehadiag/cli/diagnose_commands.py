@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -111,8 +110,7 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
     history = results.snapshot()
-    if history is not None:  # a changed setup loads its files again
-        setups = [replace(setup, history=history) for setup in setups]
+    setups = [setup.with_history(history) for setup in setups]
     print_compiling_notice()
     if arguments.merge:
         codes = {_diagnose_merged(setup, results, inputs) for setup in setups}

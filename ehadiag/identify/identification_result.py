@@ -20,7 +20,7 @@ class Estimate(msgspec.Struct, frozen=True):
     first: float
     """After the first approximation; NaN where a refinement began from an earlier diagnosis."""
     search: float
-    """After the genetic search; NaN as above."""
+    """After the genetic search; NaN where an earlier diagnosis made it needless."""
     value: float
     """After the refinement: the estimate."""
     std: float

@@ -47,6 +47,7 @@ from ehadiag.identify.partial_refinement import (
 from ehadiag.identify.posterior import no_interruption
 from ehadiag.identify.prior import EXACT_UNIT_PRIOR, UnitPrior, basic_nuisances_of
 from ehadiag.identify.severity_estimate import (
+    NOT_SEARCHED,
     SeverityAttempt,
     attempt_from_prior,
     best_further_attempt,
@@ -76,6 +77,8 @@ from ehadiag.model.registry import FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
 from firmware_iface.stored_test import Line, SearchWindows, StoredTest
+
+np.empty(2**22 - 1024)  # glibc keeps blocks up to the largest one freed: no page is faulted anew
 
 
 class NuisanceMode(Enum):
@@ -269,9 +272,11 @@ class IdentificationSession:
         progress("first approximation", 0.0)
         first, start = self._first(experiments)
         searched_at = time.perf_counter()
-        found = staged_search(
-            self._stages(experiments, start, partial(progress, "search")), progress
-        )
+        found = NOT_SEARCHED
+        # The optimum of the search counts where the first approximation is too far off.
+        if self.earlier is None or not self._resembles(experiments, start):
+            stages = self._stages(experiments, start, partial(progress, "search"))
+            found = staged_search(stages, progress)
         search_s = time.perf_counter() - searched_at
         progress("refinement", 0.0)
         has_inexact_data = self.prior.has_inexact_data

@@ -96,16 +96,22 @@ def refine_severities(
     spread: of the severities about it, shape (c,), or of each of them. between, schedule: see
     `search_posterior`.
     """
+    begin = density_about(model, start, spread)
+    nothing = np.zeros((len(begin.x), len(begin.x)))
+    found = search_posterior(model, begin, begin, nothing, linearised_on_cross, schedule, between)
+    return refinement_by_lines(model, found.density.x, found.linear, settled=found.settled)
+
+
+def density_about(
+    model: Derivatives, start: Mapping[str, float], spread: Array | float
+) -> ParameterDensity:
+    """Lay a density about a start, see `refine_severities`."""
     x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
     curved = model.curved
-    begin = ParameterDensity(
+    return ParameterDensity(
         np.clip(x, model.lower, model.upper),
         np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
     )
-    found = search_posterior(
-        model, begin, begin, np.zeros((len(x), len(x))), linearised_on_cross, schedule, between
-    )
-    return refinement_by_lines(model, found.density.x, found.linear, settled=found.settled)
 
 
 def refinement_by_lines(
@@ -131,7 +137,7 @@ def refinement_at(
     information: Array | None = None,
 ) -> Refinement:
     """Evaluate an optimum; linear: the model about it, over the width of its density."""
-    residuals, considered, anchored, _ = model.at(x)
+    (residuals,), considered, anchored = model.at(x)
     held, daily = considered[~model.daily], considered[model.daily]
     found = _refinement(model, x, linear, residuals, held, anchored=anchored, settled=settled)
     return replace(found, information=information, daily=daily)
@@ -205,22 +211,85 @@ def last_round(
     the other points.
     """
     cross = CoordinateCross.about(model, density)
-    sides = cross.points[1:]
-    middle, considered, anchored, runs = model.at(density.x, *sides, *others)
-    linear = cross.lines(model, np.concatenate([middle[None], runs[: len(sides)]]))
+    count = len(cross.points)
+    runs, considered, anchored = model.at(*cross.points, *others)
+    linear = cross.lines(model, runs[:count])
+    found = refined_by_step(model, linear, considered, anchored, settled=settled)
+    return found, [capped_cost(linear.middle), *map(capped_cost, runs[count:])]
+
+
+def refined_by_step(
+    model: Derivatives,
+    linear: LinearModel,
+    considered: Array,
+    anchored: int,
+    *,
+    settled: bool = True,
+) -> Refinement:
+    """Step by the lines, with oil and supply free: the residuals are moved by both.
+
+    considered, anchored: of `Derivatives.at`.
+    """
     daily = considered[model.daily]
     x, shift = _last_round_step(
         model, linear, linear.residuals, daily, weighings=LAST_ROUND_WEIGHINGS
     )
     moved = replace(linear, residuals=linear.residuals + shift, middle=linear.middle + shift)
     found = refinement_by_lines(model, x, moved, settled=settled)
-    found = replace(
+    return replace(
         found,
         considered=considered[~model.daily],
         daily=daily,
         anchored=anchored,
     )
-    return found, [capped_cost(middle), *map(capped_cost, runs[len(sides) :])]
+
+
+MAX_JUMPED_ROWS = 2
+"""Rows that jump where no break-away does, 1: one a tick later moves three samples and more."""
+MAX_REST_STEP = 0.5
+"""Step of a round at rest, in deviations: with 0.5, 0.7 and 1 the estimates of 324 refinements
+(`tools/study cube --wear`) were at most 0.41, 0.44 and 0.51 from a search's."""
+
+
+def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> Refinement | None:
+    """Refine from values so near the optimum that the second of two rounds finds it at rest.
+
+    model, start, spread: as of `refine_severities`. A round takes half a block: seven runs, and one
+    of oil or supply. None where the second one makes a step, or has a break-away within its width:
+    where that is, the optimum depends on where a round comes from.
+    """
+    effects: Array | float = 0.0
+    for days in (slice(0, None, 2), slice(1, None, 2)):
+        density = density_about(model, start, spread)
+        cross = CoordinateCross.about(model, density)
+        runs, considered, anchored = model.at(*cross.points, days=days)
+        considered[model.daily] += effects
+        effects = considered[model.daily]
+        linear = cross.lines(model, runs)
+        found = refined_by_step(model, linear, considered, anchored)
+        jumped = found.weighted & (linear.scatter >= ESTIMATION.max_row_scatter)
+        if np.count_nonzero(jumped) > MAX_JUMPED_ROWS:
+            return None
+        step = ((found.x - density.x) * model.scale)[model.curved]
+        start, spread = found.values, near_spread(found)
+    far = np.abs(step) > MAX_REST_STEP / FEW_UNKNOWNS_SCHEDULE.width * spread
+    return None if far.any() else found
+
+
+def near_spread(found: Refinement) -> Array:
+    """Width of the severities' density for a round about an optimum, see `refine_severities`."""
+    std = np.hypot(deviations(found.normal) * found.scale, ESTIMATION.discrepancy_std)
+    severities = np.array([item.adds_to is None for item in found.parameters])
+    return np.minimum(FEW_UNKNOWNS_SCHEDULE.width * std[severities], SEARCH_OPTIMUM_STD)
+
+
+MIN_INFORMATION = 1e-12
+"""Information on what no sample shows, in units of the scales."""
+
+
+def deviations(normal: Array) -> Array:
+    """Standard deviations of the estimates by their information."""
+    return np.sqrt(np.diag(np.linalg.inv(normal + MIN_INFORMATION * np.eye(len(normal)))))
 
 
 def refined_with_day(model: Derivatives, found: Refinement, linear: LinearModel) -> Refinement:
