@@ -198,7 +198,7 @@ def refine_near(
         residuals=linear.residuals + np.tensordot(offsets, linear.jacobian, 1),
     )
     near = refined_by_step(model, linear, runs[:0], 0)
-    # A model of alike lanes has as few halvings as they need: half a deviation of jack friction.
+    # With as few halvings as they ask for, jack friction is half a deviation off, with more 0.03.
     levels = np.minimum(free.levels + 1, MAX_JACK_LEVEL)
     whole = anchored_derivatives(judged, levels=levels)
     found = rest_near(whole, near.values, near_spread(near))

@@ -23,7 +23,6 @@ from ehadiag.identify.partial_refinement import (
     add_last_part,
     free_run_residuals,
     refine_first_part,
-    refine_near,
 )
 from ehadiag.identify.posterior import no_interruption
 from ehadiag.identify.solvers import Objective, SearchResult, Solver
@@ -112,23 +111,8 @@ def refined_attempt(
     return SeverityAttempt(found, best, judged, evaluations, score)
 
 
-def attempt_from_prior(
-    experiments: Sequence[Experiment],
-    prior: Mapping[str, float],
-    between: Callable[[], None] = no_interruption,
-) -> SeverityAttempt | None:
-    """Refine from the severities of an earlier diagnosis, by name, without a search.
-
-    None where nothing is at rest near them, see `refine_near`.
-    """
-    near = refine_near(experiments, prior, between)
-    if near is None:
-        return None
-    return SeverityAttempt(NOT_SEARCHED, *near, near[0].evaluations, np.nan)
-
-
 NOT_SEARCHED = SearchResult(np.full(len(FAULTS), np.nan), np.nan, 0, 0, np.zeros(0))
-"""Where a diagnosis has an earlier one."""
+"""Of a refinement that needed no search."""
 
 
 def best_further_attempt(
