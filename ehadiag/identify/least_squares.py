@@ -244,38 +244,42 @@ def refined_by_step(
     )
 
 
+MAX_NEAR_ROUNDS = 3
+"""Rounds of `rest_near`, 1: a fourth would take as long as what a search saves."""
 MAX_JUMPED_ROWS = 2
 """Rows that jump where no break-away does, 1: one a tick later moves three samples and more."""
-MAX_REST_STEP = 1.0
-"""Step of a round at rest, in deviations; half of it with one row that jumps, a third with two.
-With 0.5, 1 and 1.5 where none does and 0.5 else, 178, 189 and 193 of 324 refinements rested, at
-most 0.41, 0.41 and 0.44 deviations from a search's estimate; with 1 everywhere at most 0.51."""
+MIN_JUMP_SCATTER = 0.3
+"""Scatter about a line from which a row jumps, in variances: half a deviation. With 1 five of 104
+refinements ended up to 1.6 deviations from a search's estimate."""
+MAX_REST_STEP = 0.5
+"""Step of a round at rest, in deviations; with 1 one of 98 refinements ended 1.6 away."""
 
 
 def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> Refinement | None:
-    """Refine from values so near the optimum that the second of two rounds finds it at rest.
+    """Refine from values so near the optimum that the second or third round finds it at rest.
 
     model, start, spread: as of `refine_severities`. A round takes half a block: seven runs, and one
-    of oil or supply. None where the second one makes a step, or has a break-away within its width:
-    where that is, the optimum depends on where a round comes from.
+    of oil or supply. None where rounds go on, or where a break-away is within the width of one:
+    there the optimum depends on where a round comes from.
     """
     effects: Array | float = 0.0
-    for days in (slice(0, None, 2), slice(1, None, 2)):
+    for turn in range(MAX_NEAR_ROUNDS):
         density = density_about(model, start, spread)
         cross = CoordinateCross.about(model, density)
-        runs, considered, anchored = model.at(*cross.points, days=days)
+        runs, considered, anchored = model.at(*cross.points, days=slice(turn, turn + 1))
         considered[model.daily] += effects
         effects = considered[model.daily]
         linear = cross.lines(model, runs)
         found = refined_by_step(model, linear, considered, anchored)
-        jumps = found.weighted & (linear.scatter >= ESTIMATION.max_row_scatter)
-        jumped = int(np.count_nonzero(jumps))
-        if jumped > MAX_JUMPED_ROWS:
+        jumps = found.weighted & (linear.scatter > MIN_JUMP_SCATTER)
+        if np.count_nonzero(jumps) > MAX_JUMPED_ROWS:
             return None
-        step = ((found.x - density.x) * model.scale)[model.curved]
+        step = np.abs((found.x - density.x) * model.scale)[model.curved]
         start, spread = found.values, near_spread(found)
-    most = MAX_REST_STEP / (1 + jumped) / FEW_UNKNOWNS_SCHEDULE.width * spread
-    return found if np.all(np.abs(step) <= most) else None
+        most = MAX_REST_STEP / FEW_UNKNOWNS_SCHEDULE.width * spread
+        if turn > 0 and np.all(step <= most):
+            return found
+    return None
 
 
 def near_spread(found: Refinement) -> Array:

@@ -174,7 +174,7 @@ def _refined_spans(
 def refine_near(
     experiments: Sequence[Experiment], start: Mapping[str, float], between: Callable[[], None]
 ) -> tuple[Refinement, list[Experiment]] | None:
-    """Refine whole tests from severities by name that are nearly right, in three half blocks.
+    """Refine whole tests from severities by name that are nearly right, in a few half blocks.
 
     The first one, of a model that runs free, shows noise and offsets, and leads near the optimum.
     Returns the experiments with the noise, too. None where so near there is no rest, or where the
@@ -208,8 +208,7 @@ def refine_near(
 
 
 LOOK_STD = 5e-4
-"""Width of a look at an earlier estimate, 1: of 324 refinements with a wear of up to 0.002 since
-then 165 came to rest from there, with 0.0003 163."""
+"""Width of a look at an earlier estimate, 1: a wear of up to 0.002 since then is within four."""
 MAX_JACK_LEVEL = 4
 """Most halvings of a tick of the jack, 1."""
 
