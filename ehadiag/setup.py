@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import threading
 import time
@@ -218,6 +219,12 @@ class Setup:
     """Health history whose last diagnosis of a unit a new one may begin from."""
     label: str = ""
     """Tells its results from those of other actuators on the same bus; empty of the only one."""
+
+    def with_history(self, history: HistorySnapshot | None) -> Setup:
+        """Return the same with a health history; what is loaded already is kept."""
+        found = copy.copy(self)
+        vars(found)["history"] = history
+        return found
 
     @cached_property
     def actuator(self) -> Actuator:

@@ -7,7 +7,6 @@ import glob
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -123,8 +122,7 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
     history = results.history.snapshot()
-    if history is not None:  # a changed setup loads its files again
-        setups = [replace(setup, history=history) for setup in setups]
+    setups = [setup.with_history(history) for setup in setups]
     return BatchRun(arguments, setups, results, inputs).run()
 
 

@@ -42,13 +42,14 @@ from ehadiag.identify.partial_refinement import (
     StartResiduals,
     first_part_spans,
     refine_first_part,
+    refine_near,
     start_residuals,
 )
 from ehadiag.identify.posterior import no_interruption
 from ehadiag.identify.prior import EXACT_UNIT_PRIOR, UnitPrior, basic_nuisances_of
 from ehadiag.identify.severity_estimate import (
+    NOT_SEARCHED,
     SeverityAttempt,
-    attempt_from_prior,
     best_further_attempt,
     explains_recording,
     first_part_ticks,
@@ -76,6 +77,8 @@ from ehadiag.model.registry import FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
 from firmware_iface.stored_test import Line, SearchWindows, StoredTest
+
+np.empty(2**22 - 1024)  # glibc keeps blocks up to the largest one freed: no page is faulted anew
 
 
 class NuisanceMode(Enum):
@@ -353,11 +356,10 @@ class IdentificationSession:
         if self.nuisances is NuisanceMode.ALL or self.prior.has_inexact_data:
             return None
         progress("refinement", 0.0)
-        best = attempt_from_prior(
-            experiments, earlier.severities, partial(progress, "refinement", 0.0)
-        )
-        if best is None or not _severities_suffice(best.refined):
+        near = refine_near(experiments, earlier.severities, partial(progress, "refinement", 0.0))
+        if near is None or not _severities_suffice(near[0]):
             return None
+        best = SeverityAttempt(NOT_SEARCHED, *near, near[0].evaluations, np.nan)
         first = FirstApproximation({item.name: np.nan for item in FAULTS}, 0)
         timing = _timing(begin, begin, 0.0)
         found = self._concluded_by_severities(first, best, 0, 0, timing)

@@ -120,29 +120,30 @@ class Derivatives:
         """Weighted residuals of points, shape (n, signals, N) for points of shape (n, k)."""
         return self.model.residuals(self.values(points))[0]
 
-    def at(self, x: Array, *others: Array) -> tuple[Array, Array, int, Array]:
-        """Residuals at a point, the effect of considered parameters, re-anchorings, other points'
-        runs.
+    def at(self, x: Array, *others: Array, days: slice = slice(None)) -> tuple[Array, Array, int]:
+        """Residuals at points; effect of considered parameters and re-anchorings at the first.
 
-        Shapes (signals, N), (c, signals, N) by a standard deviation of each considered parameter,
-        scalar, and (n, signals, N) of the other points, run in the same blocks.
+        Shapes (1 + n, signals, N), (c, signals, N) by a standard deviation of each considered
+        parameter, and scalar; all run in the same blocks. days: which of `daily` are run, the
+        effect of the others is 0.
         """
-        by_runs = [j for j, item in enumerate(self.considered) if not item.by_rate]
-        points = self.values(np.vstack([x, *[x] * len(by_runs), *others]))
-        for row, j in enumerate(by_runs):
-            points[1 + row, len(x) + j] = DIFFERENCES.considered_step * self.considered[j].std
+        by_runs = np.flatnonzero(self.daily)[days].tolist()
+        count = 1 + len(others)
+        points = self.values(np.vstack([x, *others, *[x] * len(by_runs)]))
+        for row, j in enumerate(by_runs, count):
+            points[row, len(x) + j] = DIFFERENCES.considered_step * self.considered[j].std
         runs, anchored = self.model.residuals(points)
         step = DIFFERENCES.considered_step
-        changes = np.empty((len(self.considered), *runs.shape[1:]))
-        changes[by_runs] = runs[1 : 1 + len(by_runs)] - runs[0]
-        for change, item in zip(changes, self.considered, strict=True):
+        considered = np.zeros((len(self.considered), *runs.shape[1:]))
+        considered[by_runs] = runs[count:] - runs[0]
+        for change, item in zip(considered, self.considered, strict=True):
             if item.by_rate:
                 change[:] = step * item.std * self._rates(runs[0])
-        considered = np.where(np.abs(changes) < DIFFERENCES.max_kink, changes, 0.0) / step
-        for change, item in zip(considered, self.considered, strict=True):
             if item.rows is not None:
                 change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
-        return runs[0], considered, int(anchored[0]), runs[1 + len(by_runs) :]
+        considered[np.abs(considered) >= DIFFERENCES.max_kink] = 0.0
+        considered /= step
+        return runs[:count], considered, int(anchored[0])
 
     def _rates(self, residuals: Array) -> Array:
         """How fast the modelled signals change, weighted, from their residuals; 1/s.

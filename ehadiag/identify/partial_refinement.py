@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, GIVE_UP
+from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP
 from ehadiag.identify.experiment import (
     ANCHOR_THRESHOLDS_LSB,
     Experiment,
@@ -25,21 +25,27 @@ from ehadiag.identify.experiment import (
     with_residual_noise,
 )
 from ehadiag.identify.least_squares import (
+    MIN_INFORMATION,
     SEARCH_OPTIMUM_STD,
     Refinement,
+    density_about,
+    deviations,
     last_round,
     median_offsets,
+    near_spread,
     refine_severities,
+    refined_by_step,
+    rest_near,
 )
 from ehadiag.identify.linearisation import (
     ConsideredParameter,
+    CoordinateCross,
     Derivatives,
     ParameterDensity,
     ResidualSlope,
 )
 from ehadiag.identify.posterior import (
     FEW_UNKNOWNS_SCHEDULE,
-    SearchSchedule,
     bounded_step,
     no_interruption,
 )
@@ -112,24 +118,20 @@ def refine_first_part(
     start: Mapping[str, float],
     between: Callable[[], None] = no_interruption,
     at_start: StartResiduals | None = None,
-    spread: Array | float = SEARCH_OPTIMUM_STD,
-    schedule: SearchSchedule = FEW_UNKNOWNS_SCHEDULE,
-    judgements: int = ESTIMATION.max_noise_judgements,
 ) -> FirstPart:
     """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
     `start`: severities by name. `between`: called between rounds; what it raises ends the search.
-    `at_start`: of `start_residuals` there, if they are known. `spread`, `schedule`: see
-    `refine_severities`. `judgements`: of the noise after that of the start, at most.
+    `at_start`: of `start_residuals` there, if they are known.
     """
     spans = first_part_spans(experiments, until)
     at_start = at_start or start_residuals(experiments, until, start)
     start = {**start, **at_start.offsets}
     experiments = _with_judged_noise(experiments, until, at_start.residuals)
     levels = anchored_model(experiments, spans).levels
-    best = _refined_spans(experiments, spans, start, levels, spread, between, schedule)
+    best = _refined_spans(experiments, spans, start, levels, SEARCH_OPTIMUM_STD, between)
     evaluations = 1 + best.evaluations
-    for _ in range(judgements):
+    for _ in range(ESTIMATION.max_noise_judgements):
         before = [item.noise for item in experiments]
         judged = _with_judged_noise(experiments, until, best.residuals)
         after = [item.noise for item in judged]
@@ -137,7 +139,7 @@ def refine_first_part(
             break
         experiments = judged
         best = _refined_spans(
-            experiments, spans, best.values, levels, ESTIMATION.refined_std, between, schedule
+            experiments, spans, best.values, levels, ESTIMATION.refined_std, between
         )
         evaluations += best.evaluations
     noise = tuple(item.noise for item in experiments)
@@ -161,13 +163,54 @@ def _refined_spans(
     levels: NDArray[np.int64],
     spread: Array | float,
     between: Callable[[], None],
-    schedule: SearchSchedule,
 ) -> Refinement:
     batch = lay_out_spans(experiments, spans, anchor_lsb=ANCHOR_THRESHOLDS_LSB)
     # What is considered is worked out with the last part.
     model = SimdModel(batch, unknowns_of(experiments), levels=levels)
     derivatives = Derivatives(model, experiments[0].noise)
-    return refine_severities(derivatives, start, spread, between, schedule)
+    return refine_severities(derivatives, start, spread, between)
+
+
+def refine_near(
+    experiments: Sequence[Experiment], start: Mapping[str, float], between: Callable[[], None]
+) -> tuple[Refinement, list[Experiment]] | None:
+    """Refine whole tests from severities by name that are nearly right, in a few half blocks.
+
+    The first one, of a model that runs free, shows noise and offsets, and leads near the optimum.
+    Returns the experiments with the noise, too. None where so near there is no rest, or where the
+    start leaves more outliers than a refinement ends with.
+    """
+    batch = lay_out_spans(experiments)
+    # Its lanes are so alike that their own paths say how the jack's ticks are to be cut.
+    free = SimdModel(batch, unknowns_of(experiments), levels=np.full(len(batch.spool), -1))
+    model = Derivatives(free, experiments[0].noise)
+    cross = CoordinateCross.about(model, density_about(model, start, LOOK_STD))
+    runs = model.many(cross.points)
+    at_start = StartResiduals(runs[0], median_offsets(free, runs[0]), batch.weight)
+    if at_start.outlier_share > FIT.max_outliers_for_search:
+        return None
+    between()
+    judged = _with_judged_noise(experiments, [item.ticks for item in experiments], runs[0])
+    linear, offsets = cross.lines(model, runs), density_about(model, at_start.offsets, 0.0).x
+    linear = replace(
+        linear,
+        x=linear.x + offsets,
+        residuals=linear.residuals + np.tensordot(offsets, linear.jacobian, 1),
+    )
+    near = refined_by_step(model, linear, runs[:0], 0)
+    # With as few halvings as they ask for, jack friction is half a deviation off, with more 0.03.
+    levels = np.minimum(free.levels + 1, MAX_JACK_LEVEL)
+    whole = anchored_derivatives(judged, levels=levels)
+    found = rest_near(whole, near.values, near_spread(near))
+    if found is None:
+        return None
+    return replace(found, evaluations=model.evaluations + found.evaluations), judged
+
+
+LOOK_STD = 5e-4
+"""Width of a look at an earlier estimate, 1: a wear of up to 0.002 since then is within four."""
+MAX_JACK_LEVEL = 4
+"""Most halvings of a tick of the jack, 1."""
 
 
 def anchored_derivatives(
@@ -240,8 +283,6 @@ def _with_judged_noise(
 
 LAST_PART_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, most_rounds=4, whole_rounds=2)
 """Rounds of the whole where it is refined: the test is over by then, and the verdict awaited."""
-MIN_LAST_PART_INFORMATION = 1e-12
-"""Information on what no sample shows, in units of the scales."""
 
 
 def add_last_part(
@@ -270,7 +311,7 @@ def add_last_part(
         step = first.jacobian[:, first.used].T @ (moved - x)
         if step @ step > GIVE_UP.max_last_part_step**2:
             return None
-        std = _deviations(first.normal)
+        std = deviations(first.normal)
         others, evaluations = [x], model.evaluations
         if np.any(np.abs(moved - x)[whole.faults] > GIVE_UP.max_severity_step * std[whole.faults]):
             names = (item.name for item in whole.estimated)
@@ -279,7 +320,7 @@ def add_last_part(
             found = refine_severities(whole, start, width, schedule=LAST_PART_SCHEDULE)
             others, moved, normal, settled = [], found.x, found.normal, found.converged
         x = moved
-    width = FEW_UNKNOWNS_SCHEDULE.width * _deviations(normal)[whole.curved]
+    width = FEW_UNKNOWNS_SCHEDULE.width * deviations(normal)[whole.curved]
     root = np.diag(np.minimum(width, SEARCH_OPTIMUM_STD / whole.scale[whole.curved]))
     found, (cost, *before) = last_round(whole, ParameterDensity(x, root), settled, *others)
     if before and cost > before[0] + GIVE_UP.max_cost_rise:
@@ -298,14 +339,9 @@ def _last_part_step(
     stands, pulls = before @ first.residuals[first.used], now @ slope.residuals[taken]
     # At the optimum of the first part the gradient is 0, but into a bound.
     at_bound = (x == model.lower) | (x == model.upper)
-    normal = before @ before.T + now @ now.T + MIN_LAST_PART_INFORMATION * np.eye(len(x))
+    normal = before @ before.T + now @ now.T + MIN_INFORMATION * np.eye(len(x))
     gradient = np.where(at_bound, stands, 0.0) + pulls
     return bounded_step(x, normal, gradient, model.lower, model.upper), normal
-
-
-def _deviations(normal: Array) -> Array:
-    """Standard deviations of the estimates by their information."""
-    return np.sqrt(np.diag(np.linalg.inv(normal + MIN_LAST_PART_INFORMATION * np.eye(len(normal)))))
 
 
 class _PartRows(msgspec.Struct, frozen=True, eq=False):

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, FIT
+from ehadiag.core.criteria import FIT
 from ehadiag.identify.estimates import refinement_outlier_share
 from ehadiag.identify.experiment import Experiment, lay_out_spans, unknowns_of
 from ehadiag.identify.least_squares import Refinement, median_offsets
@@ -23,9 +23,8 @@ from ehadiag.identify.partial_refinement import (
     add_last_part,
     free_run_residuals,
     refine_first_part,
-    start_residuals,
 )
-from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE, no_interruption
+from ehadiag.identify.posterior import no_interruption
 from ehadiag.identify.solvers import Objective, SearchResult, Solver
 from ehadiag.identify.staged_search import (
     RUN_IN_S,
@@ -65,11 +64,6 @@ FULL_WINDOW_PLAN = AttemptPlan(0.02)
 the window."""
 
 
-FROM_PRIOR_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, most_rounds=4)
-"""Schedule from an earlier diagnosis: what takes more rounds stood between break-aways, up to 55
-deviations off."""
-
-
 class SeverityAttempt(msgspec.Struct, frozen=True, eq=False):
     """One search and its refinement."""
 
@@ -107,46 +101,18 @@ def refined_attempt(
     if best is None:
         ends = [item.ticks for item in experiments]
         whole = refine_first_part(experiments, ends, first.refined.values, between)
-        best, judged = _finished(experiments, whole)
+        judged = whole.judged(experiments)
+        best = add_last_part(judged, ends, whole)
+        assert best is not None  # no part is left that could lead away
+        best = replace(best, evaluations=best.evaluations + whole.evaluations)
     evaluations = first.evaluations + best.evaluations
     weight = lay_out_spans(judged).weight
     score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())
     return SeverityAttempt(found, best, judged, evaluations, score)
 
 
-def attempt_from_prior(
-    experiments: Sequence[Experiment],
-    prior: Mapping[str, float],
-    between: Callable[[], None] = no_interruption,
-) -> SeverityAttempt | None:
-    """Refine from the severities of an earlier diagnosis, by name, without a search.
-
-    None where the unit as it was then leaves more outliers than noise does, or where a few rounds
-    do not come to rest, as between break-aways they do not.
-    """
-    ends = [item.ticks for item in experiments]
-    look = start_residuals(experiments, ends, prior)
-    if look.outlier_share > FIT.max_fit_outliers:
-        return None
-    spread, schedule = ESTIMATION.refined_std, FROM_PRIOR_SCHEDULE
-    # So near the optimum the start's residuals show the noise.
-    whole = refine_first_part(experiments, ends, prior, between, look, spread, schedule, 0)
-    if not whole.refined.converged:
-        return None
-    refined, judged = _finished(experiments, whole)
-    point = np.full(len(FAULTS), np.nan)
-    found = SearchResult(point, np.nan, 0, 0, np.zeros(0))
-    return SeverityAttempt(found, refined, judged, refined.evaluations, np.nan)
-
-
-def _finished(
-    experiments: Sequence[Experiment], whole: FirstPart
-) -> tuple[Refinement, list[Experiment]]:
-    """Last round of a refinement on whole tests, and the experiments with their noise as judged."""
-    judged = whole.judged(experiments)
-    best = add_last_part(judged, [item.ticks for item in experiments], whole)
-    assert best is not None  # no part is left that could lead away
-    return replace(best, evaluations=best.evaluations + whole.evaluations), judged
+NOT_SEARCHED = SearchResult(np.full(len(FAULTS), np.nan), np.nan, 0, 0, np.zeros(0))
+"""Of a refinement that needed no search."""
 
 
 def best_further_attempt(

@@ -13,6 +13,7 @@ from ehadiag.cli import options
 from ehadiag.cli.command_parser import file_keys, project_keys
 from ehadiag.cli.main import parser_and_commands
 from ehadiag.request import Request, request_options
+from ehadiag.setup import Setup
 from firmware_iface.errors import ConfigurationError
 
 OTHER: dict[str, Any] = {
@@ -118,3 +119,9 @@ def test_one_path_stands_for_several_and_numbers_become_plain() -> None:
 
 def test_a_command_without_a_field_asks_for_the_usual() -> None:
     assert options.request_of(argparse.Namespace(seed=3, actuator="")) == Request(seed=3)
+
+
+def test_a_history_does_not_load_what_is_loaded() -> None:
+    setup = Setup(Request())
+    mapping = setup.bus_map
+    assert setup.with_history(None).bus_map is mapping

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from identify_cases import own_experiment
+from msgspec.structs import replace
 from scipy.optimize import lsq_linear
 
 from ehadiag.identify.experiment import lay_out_spans, unknowns_of
@@ -224,12 +225,33 @@ def test_what_is_considered_moves_the_residuals_but_is_not_estimated():
     free = (*FAULTS, LEAD)
     model = Derivatives(Formula(formula, free), NOISE, [ConsideredParameter(LEAD, 0.15e-6)])
     beside = np.full(len(FAULTS), 0.25)
-    residuals, considered, anchored, runs = model.at(np.full(len(FAULTS), 0.5), beside)
-    assert not residuals.any()
+    runs, considered, anchored = model.at(np.full(len(FAULTS), 0.5), beside)
     np.testing.assert_allclose(considered[0], 0.15e-6 * shape)
-    assert runs.shape == (1, *residuals.shape)
+    assert runs.shape == (2, *shape.shape)
     assert not runs.any()
     assert (anchored, len(considered), len(model.estimated)) == (0, 1, len(FAULTS))
+
+
+def test_what_is_considered_may_be_run_in_turns():
+    shapes = rows(3, 3) / 0.15e-6 / 10.0
+    three = [replace(LEAD, name=name) for name in "abc"]
+    model = Derivatives(
+        Formula(lambda *p: np.tensordot(p[-3:], shapes, 1), (*FAULTS, *three)),
+        NOISE,
+        [ConsideredParameter(item, 0.15e-6) for item in three],
+    )
+    x = np.full(len(FAULTS), 0.5)
+    whole = model.at(x)[1]
+    first, second = (model.at(x, days=slice(turn, None, 2))[1] for turn in (0, 1))
+    assert [bool(part.any()) for part in (*first, *second)] == [
+        True,
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]
+    np.testing.assert_array_equal(first + second, whole)
 
 
 def test_what_is_considered_counts_on_the_rows_that_it_is_sized_by():

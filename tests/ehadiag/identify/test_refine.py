@@ -17,9 +17,11 @@ from ehadiag.identify.experiment import lay_out_spans, unknowns_of
 from ehadiag.identify.least_squares import (
     last_round,
     median_offsets,
+    near_spread,
     refine_severities,
     refined_with_day,
     refinement_at,
+    rest_near,
 )
 from ehadiag.identify.linearisation import ParameterDensity, capped_cost, linearised_on_cross
 from ehadiag.identify.partial_refinement import anchored_derivatives, free_run_residuals
@@ -160,6 +162,23 @@ def test_the_last_round_estimates_the_oil_of_the_day():
     assert not np.any(after.jacobian[:, ~after.used])
     alone = estimate_covariance(replace(after, daily=after.daily[:0]))
     assert estimate_covariance(after)[2, 2] > 1.02 * alone[2, 2]
+
+
+@pytest.mark.parametrize("shift", [-2.0, 0.5])
+def test_rounds_near_the_optimum_end_where_a_last_round_does(shift):
+    before, std = by_the_rounds()
+    start = replace(before, x=before.x + shift * std).values
+    model, sofar = whole(), whole().evaluations
+    found = rest_near(model, start, near_spread(before))
+    after, _ = last_round(whole(), belief(), True)
+    np.testing.assert_allclose(error(found), error(after), atol=0.15)
+    assert found.evaluations - sofar <= 23  # three rounds of half a block each
+    assert found.daily.any(axis=(1, 2)).all()
+
+
+def test_a_break_away_within_reach_is_no_rest():
+    before, _ = by_the_rounds()
+    assert rest_near(whole(), before.values, 100.0 * near_spread(before)) is None
 
 
 def test_costs_of_other_points_are_theirs():
