@@ -31,7 +31,7 @@ from ehadiag import (
 )
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.verdict import VerdictRule, judge
-from ehadiag.cli import diagnose_commands as command
+from ehadiag.cli import batch_run
 from ehadiag.setup import RecordedTest, Setup
 from ehadiag.terminal.output import exit_code_of_inputs, worst_exit_code
 from firmware_iface.recording import BitOutcome, BitReason, BitState, Environment
@@ -262,7 +262,7 @@ def test_tests_of_one_recording(
         "read",
         lambda self, log, *_, **__: RecordedTest(read(self, log).recordings * 2, (), None, 0.0),
     )
-    monkeypatch.setattr(command, "diagnose_and_deliver", lambda *_: (None, next(ended)))
+    monkeypatch.setattr(batch_run, "diagnose_and_deliver", lambda *_: (None, next(ended)))
     assert run("diagnose", "--merge", "--all", HEALTHY, CLOSED).code == worst
     assert next(ended, None) is None
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ehadiag.compile import libraries, sources, worker
+from ehadiag.compile import libraries, worker
 from ehadiag.compile.elementary import C_FUNCTIONS
 from ehadiag.compile.elf import shared_library
 from ehadiag.export.targets import find_target
@@ -116,7 +116,7 @@ def test_one_compilation_serves_all_values_of_a_table(
     target = find_target("powerpc-e500mc").processor
     blank = worker.ObjectFile(functions, target, replaced=C_FUNCTIONS)
     with Folder.at(tmp_path, 0o600) as folder:
-        monkeypatch.setattr(sources, "cache_folder", lambda: folder)
+        monkeypatch.setattr(libraries, "cache_folder", lambda: folder)
         (first,) = libraries.object_files(replace(blank, tables={"plan": one}))
         assert [first] == worker.object_code(replace(blank, tables={"plan": one}))
         compiled_again = pytest.fail
@@ -153,4 +153,4 @@ def test_what_is_no_object_file_of_this_kind_is_refused() -> None:
 
 
 def test_the_digests_of_the_sources_come_with_the_package(built: Path) -> None:
-    assert (built / sources.SOURCE_DIGESTS_FILE).stat().st_size > 0
+    assert (built / libraries.SOURCE_DIGESTS_FILE).stat().st_size > 0

@@ -18,7 +18,7 @@ from places import LOGS
 
 from ehadiag import Verdict, bundled_tests, default_actuator
 from ehadiag import simulate as simulate_test
-from ehadiag.assess import acceptance, verdict
+from ehadiag.assess import verdict
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.core.actuator import Discrepancy
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
@@ -172,8 +172,8 @@ def test_a_range_of_exponents_does_what_it_does_in_the_package(values, stds):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"outliers": acceptance.FIT.max_outlier_share + 1e-3}, {"outliers": math.nan},
-     {"rms": acceptance.FIT.max_rms + 1e-3}, {"rms": math.nan}],
+    [{"outliers": verdict.FIT.max_outlier_share + 1e-3}, {"outliers": math.nan},
+     {"rms": verdict.FIT.max_rms + 1e-3}, {"rms": math.nan}],
     ids=str,
 )  # fmt: skip
 def test_what_the_model_does_not_explain_is_not_tested(wrong):
