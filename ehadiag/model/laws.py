@@ -115,49 +115,30 @@ def bridge_load(part: float, near: float, far: float, flow: float) -> tuple[floa
 
 
 @inlined
-def bridge_excess(
-    part: float, load: float, viscous: float, x: float, moving: float, value: float
-) -> tuple[float, float]:
-    """What the ends carry beyond a load, and the speed; see `bridge_root`."""
-    x += (1.0 - moving) * value
-    carried, speed = bridge_load(part, max(1.0 - x, 0.0), 1.0 + x, moving * value)
-    return carried - load - viscous * speed, speed
-
-
-@inlined
-def bridge_root(
-    part: float, load: float, viscous: float, x: float, moving: float, high: float
-) -> tuple[float, float]:
-    """Value between 0 and `high` at which a spool's ends carry a load, and its speed (PHY-43).
-
-    Of a moving spool (1) the flow by a deflection x, of one that rests (0) the further deflection.
-    """
-    low, at_low = 0.0, bridge_excess(part, load, viscous, x, moving, 0.0)[0]
-    at_high, speed = bridge_excess(part, load, viscous, x, moving, high)
-    value, side, falls = high, 0, at_low > 0.0
-    if falls == (at_high > 0.0):
-        return value, speed
-    for _ in range(BRIDGE_ROUNDS):
-        value = (low * at_high - high * at_low) / (at_high - at_low)
-        excess, speed = bridge_excess(part, load, viscous, x, moving, value)
-        if excess == 0.0:
-            break
-        if (excess > 0.0) == falls:
-            low, at_low, at_high = value, excess, at_high * (0.5 if side < 0 else 1.0)
-            side = -1
-        else:
-            high, at_high, at_low = value, excess, at_low * (0.5 if side > 0 else 1.0)
-            side = 1
-    return value, speed
-
-
-@inlined
 def bridge_stall(part: float, load: float) -> float:
     """Deflection at which a resting spool's ends carry a load, 1 over the nozzle's gap (PHY-43).
 
     part, load: see `bridge_load`.
     """
-    return bridge_root(part, load, 0.0, 0.0, 0.0, MAX_STALL_DEFLECTION)[0] if load > 0.0 else 0.0
+    if load <= 0.0:
+        return 0.0
+    low, below, high = 0.0, -load, MAX_STALL_DEFLECTION
+    above = bridge_load(part, max(1.0 - high, 0.0), 1.0 + high, 0.0)[0] - load
+    if above <= 0.0:
+        return high
+    x, side = 0.0, 0
+    for _ in range(BRIDGE_ROUNDS):
+        x = (low * above - high * below) / (above - below)
+        value = bridge_load(part, max(1.0 - x, 0.0), 1.0 + x, 0.0)[0] - load
+        if value == 0.0:
+            break
+        if value < 0.0:
+            low, below, above = x, value, above * (0.5 if side < 0 else 1.0)
+            side = -1
+        else:
+            high, above, below = x, value, below * (0.5 if side > 0 else 1.0)
+            side = 1
+    return x
 
 
 @inlined
@@ -167,8 +148,25 @@ def bridge_speed(part: float, load: float, viscous: float, x: float) -> float:
     part, load: see `bridge_load`; viscous: further load by the speed, 1; x: over the nozzle's gap,
     1. 0 where the load holds the spool.
     """
-    held = bridge_excess(part, load, viscous, x, 1.0, 0.0)[0] <= 0.0
-    return 0.0 if held else bridge_root(part, load, viscous, x, 1.0, 1.0)[1]
+    near, far = max(1.0 - x, 0.0), 1.0 + x
+    low, above = 0.0, bridge_load(part, near, far, 0.0)[0] - load
+    if above <= 0.0:
+        return 0.0
+    carried, speed = bridge_load(part, near, far, 1.0)
+    high, below, side = 1.0, carried - load - viscous * speed, 0
+    for _ in range(BRIDGE_ROUNDS):
+        flow = (low * below - high * above) / (below - above)
+        carried, speed = bridge_load(part, near, far, flow)
+        value = carried - load - viscous * speed
+        if value == 0.0:
+            break
+        if value > 0.0:
+            low, above, below = flow, value, below * (0.5 if side > 0 else 1.0)
+            side = 1
+        else:
+            high, below, above = flow, value, above * (0.5 if side < 0 else 1.0)
+            side = -1
+    return speed
 
 
 class SpoolLaw(NamedTuple):

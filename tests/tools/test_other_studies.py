@@ -66,7 +66,7 @@ def test_the_noise_of_diagnoses_is_as_stated_and_can_be_made_again() -> None:
     noise = read_noise()
     for item in noise.values():
         assert len(item.error) > 50
-        assert 0.5 < np.sqrt(np.mean((item.error / item.std) ** 2)) < 1.5
+        assert 0.5 < np.sqrt(np.mean((item.error / item["std"]) ** 2)) < 1.5
     truth = dict(zip(FAULT_NAMES, np.random.default_rng(1).uniform(0.0, 0.8, 3), strict=True))
     assert noise["Kintas"].truth[0] == pytest.approx(truth["Kintas"], abs=1e-6)
     found = ehadiag.diagnose(ehadiag.simulate("open", seed=1, faults=Faults(**truth)))
