@@ -47,7 +47,7 @@ from ehadiag.export.targets import (
     static_library,
 )
 from ehadiag.identify.estimates import FIRST_STAGE_STD
-from ehadiag.identify.prior import DAILY_PRIORS, calibration_covariance, unit_prior
+from ehadiag.identify.prior import calibration_covariance, unit_prior
 from ehadiag.model.plant import PlantConstants, plant_constants
 from ehadiag.model.registry import Unknowns, unit_constants
 from ehadiag.model.severities import FAULT_LAWS
@@ -127,7 +127,7 @@ def exported_unit(unit: Sequence[float], plan: Array) -> Array:
 def uncertain_constants(actuator: Actuator) -> list[PlantConstants]:
     """Constants of a calibrated unit, a deviation off in each direction that is not certain.
 
-    Columns of a root of the calibration's covariance, and what changes by the day.
+    Columns of a root of the calibration's covariance.
     """
     calibration = actuator.calibration
     if calibration is None:
@@ -136,7 +136,6 @@ def uncertain_constants(actuator: Actuator) -> list[PlantConstants]:
     names, effects = calibration.parameters, calibration.effects
     root = np.linalg.cholesky(calibration_covariance(calibration))
     moved = [dict(zip(names, column, strict=True)) for column in root.T]
-    moved += [{name: prior.std} for name, prior in DAILY_PRIORS.items()]
     return [
         Unknowns((), (base,), {**effects, **_sums(effects, item)}).constants(np.empty(0))
         for item in moved

@@ -22,7 +22,7 @@ from ehadiag.onboard.onboard_memory import (
     ONBOARD_PARAMETERS,
     SUMS,
 )
-from ehadiag.onboard.onboard_search import fitted_lines, parameters_at, start_models
+from ehadiag.onboard.onboard_search import fitted_lines, parameters_at, start_models, unknowns_at
 
 MIN_PIVOT = 1e-300
 """Least pivot of a matrix with an inverse, 1."""
@@ -218,8 +218,8 @@ def start_round(address: int, plan_address: int, plan: Array) -> None:
         address,
         plan_address,
         plan,
-        parameters_at(address, ONBOARD.point),
-        parameters_at(address, ONBOARD.trial),
+        unknowns_at(address, ONBOARD.point),
+        unknowns_at(address, ONBOARD.trial),
         array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES, 3)),
     )
 

@@ -102,20 +102,20 @@ def test_the_deviations_are_those_of_the_package():
         3.0 * rows @ rows.T,
         rng.standard_normal(ONBOARD_PARAMETERS),
     )
-    directions, believed = rng.standard_normal((2, ONBOARD_PARAMETERS)), np.array([0.0, 0.0, 1e-4])
+    considered, believed = np.array([1e-4, 2e-4, 0.0]), np.array([0.0, 0.0, 1e-4])
     memory = np.zeros(ONBOARD.end)
     for place, numbers in (
         (ONBOARD.normal, normal), (ONBOARD.normal + normal.size, shift), (ONBOARD.meat, meat),
-        (ONBOARD.considered, directions), (ONBOARD.believed, believed),
+        (ONBOARD.considered, considered), (ONBOARD.believed, believed),
     ):  # fmt: skip
         memory[place : place + numbers.size] = numbers.ravel()
-    assert onboard_optimum.write_deviations(memory.ctypes.data, PLAN, 2, 1.3) == 0
+    assert onboard_optimum.write_deviations(memory.ctypes.data, PLAN, ONBOARD_PARAMETERS, 1.3) == 0
     inverse = np.linalg.inv(normal + np.diag([12.0] * ONBOARD_GENES + [0.0] * 2))
     sandwich = inverse @ meat @ inverse
     curved = inverse * 1.3 / ESTIMATION.capped_variance
     variance = np.maximum(np.diag(curved), np.diag(sandwich))[:ONBOARD_GENES]
-    moved = inverse @ np.vstack([shift, directions]).T
-    variance = np.maximum(variance, believed) + (moved**2).sum(axis=1)[:ONBOARD_GENES]
+    moved = (inverse @ shift)[:ONBOARD_GENES]
+    variance = np.maximum(variance, believed) + moved**2 + considered
     expected = np.sqrt(variance + ESTIMATION.discrepancy_std**2)
     assert memory[ONBOARD_GENES : 2 * ONBOARD_GENES] == pytest.approx(expected, rel=1e-9)
 

@@ -49,7 +49,7 @@ from ehadiag_tools.onboard.replay import (
     ticks_of,
     unit_of,
 )
-from ehadiag_tools.simulator.units import Unit
+from ehadiag_tools.simulator.units import Unit, add_group
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import RESULT_MODE, Folder
@@ -250,13 +250,15 @@ DATA = ("textbook", "calibrated", *UNKNOWN)
 class OnboardUnit:
     """Unit `case` of a seed, recorded in a stored test.
 
-    Data: one of `DATA`. Bits: whether the builds of the kernels for this computer are compared.
+    Data: one of `DATA`. Groups: of effects of a calibrated one, see `random_unit`. Bits: whether
+    the builds of the kernels for this computer are compared.
     """
 
     test: str
     case: int
     seed: int
     data: str = "textbook"
+    groups: tuple[str, ...] = ()
     bits: bool = False
 
 
@@ -301,7 +303,8 @@ def _library(unit: UnitCase | None, build: str = "host") -> OnboardLibrary:
 def perform_random(case: OnboardUnit) -> Record:
     """Identify a recording of a random unit on board and by the package."""
     of_unit = case.data == "calibrated"
-    drawn = UnitCase(case.test, case.case, case.seed, data="calibrated" if of_unit else "textbook")
+    kind = "calibrated" if of_unit else "textbook"
+    drawn = UnitCase(case.test, case.case, case.seed, data=kind, groups=case.groups)
     unit, severities = draw_unit(drawn)
     recording = record_worn(drawn, UNKNOWN.get(case.data, unit), case.test, severities)
     known = replaced(drawn, test=TESTS[0]) if of_unit else None
@@ -350,11 +353,12 @@ def _random_options(parser: argparse.ArgumentParser) -> None:
     add("--test", action="append", choices=TESTS, help="may be repeated (both)")
     add("--data", action="append", choices=DATA, help="what the units are (textbook)")
     add("--bits", action="store_true", help="compare builds for this computer, not the package")
+    add_group(parser)
 
 
 def _random_cases(options: Options) -> list[OnboardUnit]:
     return [
-        OnboardUnit(test, case, options.seed, data, options.bits)
+        OnboardUnit(test, case, options.seed, data, tuple(sorted(set(options.group))), options.bits)
         for data in options.data or DATA[:1]
         for case in range(options.cases)
         for test in options.test or TESTS
