@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -181,14 +182,17 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
     levels, (outliers, rms) = Levels(), residual_limits(actuator.calibration)
     prior, valve = unit_prior(actuator), actuator.servovalve
     low, high = prior.exponents
+    exact = actuator.calibration is None and low == high and not any(prior.discrepancy.values())
     _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
     return VerdictRules(
         advisory=levels.advisory,
         limit=levels.limit,
         false_healthy=VERDICT.max_chance_false_healthy,
         fault_chance=VERDICT.min_chance_fault,
-        most_outliers=outliers,
+        # Where nothing is in doubt but the noise, what is left is an effect; the package frees it.
+        most_outliers=FIT.max_outliers_of_noise if exact else outliers,
         most_rms=rms,
+        most_excess=FIT.max_excess_without_nuisances if exact else math.inf,
         search_outliers=max(FIT.max_fit_outliers, outliers - FIT.max_outlier_share),
         most_anchored=float(FIT.max_anchor_count),
         most_std=FIT.max_shown_std,

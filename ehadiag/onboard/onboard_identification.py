@@ -2,8 +2,9 @@
 
 The recording is looked at; the three searches of single severities lead to the refinement, which
 sharpens a density of severities and offsets. Where its optimum does not explain the recording the
-compact genetic algorithm searches wider, and it is refined again. The last pass gives standard
-deviations and verdict. Each phase is passes over the recording, and a pass may stop after any tick.
+refinement begins anew over the usual sizes, and after that the compact genetic algorithm searches
+wider. The last passes give standard deviations and verdict. Each phase is passes over the
+recording, and a pass may stop after any tick.
 """
 
 from __future__ import annotations
@@ -157,8 +158,7 @@ def start_pass(address: int, plan_address: int, plan: Array) -> None:
     elif phase == PHASES.grids:
         start_grid(address, plan_address, plan, int(p[PROGRESS.stage]), steps)
     elif phase == PHASES.search:
-        std = SEARCH.stds[int(p[PROGRESS.attempts]) - 2]
-        start_generation(address, plan_address, plan, steps, std)
+        start_generation(address, plan_address, plan, steps)
     elif phase == PHASES.noise:
         start_noise(address, plan_address, plan)
         clear_channels(channel_sums_at(address))
@@ -263,7 +263,7 @@ def end_pass(address: int, plan: Array) -> float:
         if end_generation(address, int(steps)):
             following = PHASES.noise
     elif phase == PHASES.noise:
-        end_noise(address, ROUNDS.start_std)
+        end_noise(address, ROUNDS.start_std if p[PROGRESS.attempts] == 1.0 else ROUNDS.wide_std)
         following = PHASES.refinement
     elif phase == PHASES.refinement:
         last, settled = end_round(address, steps + 1.0)

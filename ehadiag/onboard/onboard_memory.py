@@ -223,7 +223,7 @@ class ChannelSums(NamedTuple):
     """Residual of the tick before, and of the one before that."""
     earlier: float
     squares: float
-    """Capped squares of residuals."""
+    """Capped squares of residuals; in a look at the recording the sum of its samples."""
     samples: float
     gap: float
     """Ticks without a sample since the last one, and the longest such time."""
@@ -284,6 +284,8 @@ class VerdictRules(NamedTuple):
     """Share of residuals beyond three deviations that an explained recording may have."""
     most_rms: float
     """Rms residual that it may have, in units of noise."""
+    most_excess: float
+    """Excess of the residuals over noise that it may have, 1."""
     search_outliers: float
     """Share of residuals beyond three deviations that needs no further search."""
     most_anchored: float

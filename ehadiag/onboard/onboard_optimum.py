@@ -10,7 +10,7 @@ from typing import Final
 from ehadiag.compile.elementary import exponential, logarithm, normal_cdf
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
-from ehadiag.core.criteria import ESTIMATION, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.linearisation import DIFFERENCES
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.severities import FAULT_CHANGES
@@ -65,7 +65,6 @@ from ehadiag.onboard.onboard_search import (
     LARGEST_SECOND_DIFFERENCE,
     PLAN_PRESSURE_WEIGHT,
     PLAN_SPOOL_WEIGHT,
-    SEARCH,
     clear_histograms,
     count_residual,
     fitted_lines,
@@ -147,7 +146,7 @@ def write_verdict(address: int, plan: Array) -> int:
     above, at_limit, hidden = 0.0, False, False
     for i in range(ONBOARD_GENES):
         hidden = hidden or not p[ONBOARD_GENES + i] < rules.most_std
-    _doubt_laws(p, channel_sums_at(address), rules)
+    excess = _doubt_laws(p, channel_sums_at(address), rules)
     friction, blind = CERTAIN, False
     if rules.exponents > 0.0:
         friction = _over_exponents(p, rules)
@@ -161,7 +160,8 @@ def write_verdict(address: int, plan: Array) -> int:
         low, high = p[i] - NORMAL_HALF_WIDTH_95 * std, p[i] + NORMAL_HALF_WIDTH_95 * std
         blind = blind or (low < rules.advisory and high > rules.limit)
     reasons = 0.0
-    if not _is_explained(o.outliers, o.spool_rms, o.pressure_rms, rules):
+    explained = _is_explained(o.outliers, o.spool_rms, o.pressure_rms, rules)
+    if not (explained and excess <= rules.most_excess):
         reasons += REASONS.unexplained
     if hidden:
         reasons += REASONS.hidden
@@ -178,8 +178,11 @@ CERTAIN, UNLIKELY_FAULT, LIKELY_FAULT = range(3)
 
 
 @inlined_exact
-def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> None:
-    """Widen the deviations, see `ehadiag.identify.prior.UnitPrior.discrepancy_covariance`."""
+def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> float:
+    """Widen the deviations, see `ehadiag.identify.prior.UnitPrior.discrepancy_covariance`.
+
+    Returns the excess of the residuals over noise.
+    """
     excess = max(shown_excess(p, 0, sums[0, REST]), shown_excess(p, 1, sums[1, REST]), 1.0)
     more = 1.0 + math.sqrt(excess - 1.0)
     clogging, friction = p[KINTAS], p[FSS]
@@ -192,6 +195,7 @@ def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> None:
         if doubt != 0.0:
             std = p[ONBOARD_GENES + i]
             p[ONBOARD_GENES + i] = math.sqrt(std * std + more * doubt * more * doubt)
+    return excess
 
 
 @inlined_exact
@@ -285,8 +289,11 @@ MAX_DAY = 20.0
 """Largest step of viscosity and supply, in deviations, 1: there is some viscosity left."""
 DAY_MODELS = 1 + ONBOARD_GENES + ONBOARD_UNKNOWNS - ONBOARD_PARAMETERS
 """Models of a step of the day: at the point, and one for each unknown but the offsets."""
-ATTEMPTS = 1.0 + len(SEARCH.stds)
-"""Searches that there are, 1: the first approximation, then the genetic ones."""
+NEAR_OUTLIERS = FIT.max_outliers_for_search
+"""Largest share of outliers at which residuals show the noise, 1."""
+ATTEMPTS = 3.0
+"""Attempts that there are, 1: from the first approximation, over the usual sizes about where that
+leads, and from the genetic search."""
 ANCHORED_PLACE = ONBOARD.monitors + MODEL.state + ROWS.anchor_count
 USED_SQUARES, USED, UNEXPLAINED, UNEXPLAINED_SQUARES, _, LAWS, _ = range(
     ONBOARD.sums, ONBOARD.sums + 7
@@ -420,16 +427,17 @@ def _take_best(address: int) -> None:
 def end_conclusion(address: int, plan: Array) -> float:
     """Judge an optimum; the phase that follows.
 
-    The noise is another: refine again. The recording is not explained: search wider, as long as
-    there is an attempt left; then the best optimum is the result.
+    The noise is another, near an optimum: refine again. The recording is not explained: search
+    wider, as long as there is an attempt left; then the best optimum is the result.
     """
     p, sums = array_at(address, (ONBOARD.end,)), channel_sums_at(address)
     rules, attempts = verdict_rules_of(plan), p[PROGRESS.attempts]
     p[PROGRESS.judged] += 1.0
-    if attempts <= ATTEMPTS and _noise_changes(p, p[PROGRESS.judged]):
+    samples, outliers = sums[0, SAMPLES] + sums[1, SAMPLES], sums[0, OUTLIERS] + sums[1, OUTLIERS]
+    near = outliers <= NEAR_OUTLIERS * samples
+    if attempts <= ATTEMPTS and near and _noise_changes(p, p[PROGRESS.judged]):
         set_density(p, ESTIMATION.refined_std)
         return PHASES.refinement
-    samples, outliers = sums[0, SAMPLES] + sums[1, SAMPLES], sums[0, OUTLIERS] + sums[1, OUTLIERS]
     explained = (
         outliers <= rules.search_outliers * samples and p[ANCHORED_PLACE] <= rules.most_anchored
     )
@@ -437,6 +445,9 @@ def end_conclusion(address: int, plan: Array) -> float:
         best = _keeps_best(address)
         p[PROGRESS.judged] = 0.0
         p[PROGRESS.attempts] += 1.0
+        if attempts == 1.0:
+            set_density(p, ROUNDS.wide_std)
+            return PHASES.refinement
         if attempts < ATTEMPTS:
             return PHASES.search
         if not best:
@@ -499,10 +510,8 @@ def add_day(address: int, plan: Array, k: int) -> None:
         r = p[at] / noise
         smooth = math.isfinite(r) and r * r < ESTIMATION.residual_cap
         for lane in range(1, DAY_MODELS):
-            i = _moved_by(lane)
-            most = DIFFERENCES.max_considered if i < ONBOARD_GENES else DIFFERENCES.max_kink
-            change = p[at + lane * MONITOR_SIZE] / noise - r
-            smooth = smooth and abs(change) < most
+            i, change = _moved_by(lane), p[at + lane * MONITOR_SIZE] / noise - r
+            smooth = smooth and abs(change) < DIFFERENCES.max_kink
             slope[i] = change / p[ONBOARD.along + i]
         slope[ONBOARD_GENES] = slope[ONBOARD_GENES + 1] = 0.0
         slope[ONBOARD_GENES + c] = -1.0 / noise
@@ -586,7 +595,7 @@ def add_directions(address: int) -> None:
         smooth = math.isfinite(middle) and middle * middle < ESTIMATION.residual_cap
         for i in range(ONBOARD_GENES):
             change = p[at + (1 + i) * MONITOR_SIZE] / noise - middle
-            smooth = smooth and abs(change) < DIFFERENCES.max_considered
+            smooth = smooth and abs(change) < DIFFERENCES.max_kink
             slope[i] = change / p[ONBOARD.along + i]
         if not smooth:
             continue

@@ -97,13 +97,17 @@ class OnboardSearchRules(NamedTuple):
     """Least noise, in units of the plan's: a converter's rounding alone makes more."""
     min_rest_samples: float = float(ESTIMATION.min_rest_samples)
     """Least number of samples at rest from which an offset is taken, 1."""
+    most_held: float = 20.0
+    """Distance of the spool at rest from its mean in closed loop, in units of the plan's noise,
+    from which on it is held beside its middle: of seven units the mean was within 9 of the offset,
+    and a spool that was held up to 230 off."""
     run_in_s: float = SEARCH_STAGES.first_run_in_s
     """Run-in before a window, s."""
-    stds: tuple[float, ...] = (0.1, 0.4)
-    """Standard deviations of a severity at the start of each genetic search, 1: those of the
-    further attempts in `ehadiag.identify`."""
+    std: float = 0.4
+    """Standard deviation of a severity at the start of the genetic search, 1: that of the last
+    attempt in `ehadiag.identify`."""
     generations: int = 40
-    """Largest number of generations of each, 1."""
+    """Largest number of generations, 1."""
     virtual_population: float = 42.0
     """Size of the population that the probability vector stands for, 1."""
     tolerance: float = 1e-4
@@ -469,9 +473,7 @@ def _search_state(address: int) -> CompactGaState:
 
 
 @bare_kernel
-def start_generation(
-    address: int, plan_address: int, plan: Array, generation: int, std: float
-) -> None:
+def start_generation(address: int, plan_address: int, plan: Array, generation: int) -> None:
     """Draw a generation and prepare its models; the first about the best point."""
     p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
     population = array_at(
@@ -480,7 +482,7 @@ def start_generation(
     if generation == 0:
         for i in range(ONBOARD_GENES):
             p[ONBOARD.mean + i] = p[ONBOARD.elite + i] = p[ONBOARD.point + i]
-            p[ONBOARD.spread + i] = std
+            p[ONBOARD.spread + i] = SEARCH.std
         p[ONBOARD.generator], p[ONBOARD.generator + 1] = math.inf, 0.0
     draw_generation(_search_state(address), population)
     for lane in range(ONBOARD_MODELS):
