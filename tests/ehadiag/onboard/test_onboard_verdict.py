@@ -20,7 +20,7 @@ from ehadiag import Verdict, bundled_tests, default_actuator
 from ehadiag import simulate as simulate_test
 from ehadiag.assess import acceptance, verdict
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.core.actuator import Calibration, CalibrationSource, Discrepancy, FitQuality
+from ehadiag.core.actuator import Discrepancy
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.export.library import exported_unit, library_plan
@@ -244,36 +244,6 @@ def test_surroundings_that_cannot_be_are_refused(around):
     assert (unit == 3.0).all()
 
 
-CALIBRATED = replace(
-    ACTUATOR,
-    calibration=Calibration(
-        date="2026-01-02T03:04:05Z", start="reference-31", effects={"null_bias": 1.1e-4},
-        parameters=("null_bias",), std=(5e-8,), root=((1.0,),),
-        fit=FitQuality(excess=1.0, outliers=0.002, spool_rms=1.0, pressure_rms=1.0),
-        recordings=(CalibrationSource(name="a.blf", test="open", sha256="00"),),
-    ),
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_oil_and_supply_of_the_day_are_estimated_for_a_calibrated_unit():
-    """Sensors at the ends of what they may be off: no wider than in the package, and right."""
-    severities = {"Kintas": 0.3, "FSS": 0.2, "FDJ": 0.5}
-    recording = simulate_test(
-        "open", null_bias=1.1e-4, temperature_error=2.0, supply_error=0.1e6, seed=4, **severities
-    )
-    host = diagnose([recording], CALIBRATED, TESTS).identification
-    library = host_library.__wrapped__(CALIBRATED)
-    _, memory = run(
-        surrounded(recording, CALIBRATED), ticks_of(recording), 1e9, CALIBRATED, library
-    )
-    found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
-    assert found.verdict == 10.0
-    for value, std, item in zip(found[:3], found[3:6], host.estimates, strict=True):
-        assert 0.7 < std / item.std < 1.5
-        assert abs(value - severities[item.name]) < 3.0 * std
-
-
 def test_a_spool_that_friction_holds_beside_its_middle_is_no_offset():
     """In closed loop, with the position's sensor off: the spool rests 60 LSB from its offset."""
     severities = {"Kintas": 0.4377, "FSS": 0.6481, "FDJ": 0.5719}
@@ -347,9 +317,9 @@ def carried(ticks, supply=2e7):
     return bool(memory[PROGRESS.phase] == PHASES.grids)
 
 
-def run(unit, ticks, work, actuator=None, library=None):
+def run(unit, ticks, work, actuator=None):
     """Code of the first slice of an identification on board, and its memory."""
-    plan, library = plan_of(actuator or ACTUATOR), library or host_library(actuator)
+    plan, library = plan_of(actuator or ACTUATOR), host_library(actuator)
     memory, start = np.zeros(ONBOARD.end), exported_unit(unit, plan)
     ticks, amounts = np.ascontiguousarray(ticks), np.array([len(ticks), work])
     begin = library.function("eha_identify_begin", 2)
