@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -44,7 +45,7 @@ from ehadiag.export.targets import (
     static_library,
 )
 from ehadiag.identify.estimates import FIRST_STAGE_STD
-from ehadiag.identify.prior import DAILY_PRIORS, calibration_covariance, unit_prior
+from ehadiag.identify.prior import calibration_covariance, unit_prior
 from ehadiag.model.plant import PlantConstants, plant_constants
 from ehadiag.model.registry import Unknowns, unit_constants
 from ehadiag.model.severities import FAULT_LAWS
@@ -124,7 +125,7 @@ def exported_unit(unit: Sequence[float], plan: Array) -> Array:
 def uncertain_constants(actuator: Actuator) -> list[PlantConstants]:
     """Constants of a calibrated unit, a deviation off in each direction that is not certain.
 
-    Columns of a root of the calibration's covariance, and what changes by the day.
+    Columns of a root of the calibration's covariance.
     """
     calibration = actuator.calibration
     if calibration is None:
@@ -133,7 +134,6 @@ def uncertain_constants(actuator: Actuator) -> list[PlantConstants]:
     names, effects = calibration.parameters, calibration.effects
     root = np.linalg.cholesky(calibration_covariance(calibration))
     moved = [dict(zip(names, column, strict=True)) for column in root.T]
-    moved += [{name: prior.std} for name, prior in DAILY_PRIORS.items()]
     return [
         Unknowns((), (base,), {**effects, **_sums(effects, item)}).constants(np.empty(0))
         for item in moved
@@ -179,14 +179,17 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
     levels, (outliers, rms) = Levels(), residual_limits(actuator.calibration)
     prior, valve = unit_prior(actuator), actuator.servovalve
     low, high = prior.exponents
+    exact = actuator.calibration is None and low == high and not any(prior.discrepancy.values())
     _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
     return VerdictRules(
         advisory=levels.advisory,
         limit=levels.limit,
         false_healthy=VERDICT.max_chance_false_healthy,
         fault_chance=VERDICT.min_chance_fault,
-        most_outliers=outliers,
+        # Where nothing is in doubt but the noise, what is left is an effect; the package frees it.
+        most_outliers=FIT.max_outliers_of_noise if exact else outliers,
         most_rms=rms,
+        most_excess=FIT.max_excess_without_nuisances if exact else math.inf,
         search_outliers=max(FIT.max_fit_outliers, outliers - FIT.max_outlier_share),
         most_anchored=float(FIT.max_anchor_count),
         most_std=FIT.max_shown_std,

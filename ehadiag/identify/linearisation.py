@@ -33,9 +33,6 @@ class DifferenceRules(NamedTuple):
     derivative."""
     max_kink: float = 0.3
     """Largest disagreement of two-sided differences, in deviations; more is a break-away."""
-    max_considered: float = 1.0
-    """Largest change by a whole deviation of a considered parameter on board, in deviations; more
-    is a break-away."""
     considered_step: float = 0.125
     """Change of a considered parameter for its effect, in its deviations: half a deviation of oil
     at -20 °C changes the pressure by less than its noise, as a break-away does not."""

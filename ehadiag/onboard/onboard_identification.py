@@ -2,8 +2,9 @@
 
 The recording is looked at; the three searches of single severities lead to the refinement, which
 sharpens a density of severities and offsets. Where its optimum does not explain the recording the
-compact genetic algorithm searches wider, and it is refined again. The last pass gives standard
-deviations and verdict. Each phase is passes over the recording, and a pass may stop after any tick.
+refinement begins anew over the usual sizes, and after that the compact genetic algorithm searches
+wider. The last passes give standard deviations and verdict. Each phase is passes over the
+recording, and a pass may stop after any tick.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ehadiag.monitor.monitor_memory import (
     prepare_monitor,
 )
 from ehadiag.onboard.onboard_memory import (
+    DIRECTIONS_OF_PASS,
     ONBOARD,
     ONBOARD_GENES,
     ONBOARD_MODELS,
@@ -33,13 +35,16 @@ from ehadiag.onboard.onboard_memory import (
     REASONS,
 )
 from ehadiag.onboard.onboard_optimum import (
-    DIRECTIONS_OF_PASS,
+    add_day,
     add_directions,
     add_evidence,
     direction_count,
     end_conclusion,
+    end_day,
+    end_directions,
     refuse_verdict,
     start_conclusion,
+    start_day,
     start_directions,
     write_result,
 )
@@ -153,8 +158,7 @@ def start_pass(address: int, plan_address: int, plan: Array) -> None:
     elif phase == PHASES.grids:
         start_grid(address, plan_address, plan, int(p[PROGRESS.stage]), steps)
     elif phase == PHASES.search:
-        std = SEARCH.stds[int(p[PROGRESS.attempts]) - 2]
-        start_generation(address, plan_address, plan, steps, std)
+        start_generation(address, plan_address, plan, steps)
     elif phase == PHASES.noise:
         start_noise(address, plan_address, plan)
         clear_channels(channel_sums_at(address))
@@ -162,8 +166,10 @@ def start_pass(address: int, plan_address: int, plan: Array) -> None:
         start_round(address, plan_address, plan)
     elif phase == PHASES.conclusion:
         start_conclusion(address, plan_address, plan)
-    else:
+    elif phase == PHASES.considered:
         start_directions(address, plan_address, plan, steps)
+    else:
+        start_day(address, plan_address, plan)
 
 
 @bare_kernel
@@ -216,7 +222,9 @@ def pass_tick(address: int, plan: Array, ticks_address: int, ticks: Array, k: in
     elif phase == PHASES.conclusion:
         add_evidence(address, plan, ticks, k)
     elif phase == PHASES.considered:
-        add_directions(address, plan, int(p[PROGRESS.steps]))
+        add_directions(address)
+    elif phase in (PHASES.day, PHASES.last_day):
+        add_day(address, plan, k)
     elif phase == PHASES.search and counts:
         add_costs(address, SEARCH.cap, SEARCH.cap)
     elif counts:
@@ -255,20 +263,26 @@ def end_pass(address: int, plan: Array) -> float:
         if end_generation(address, int(steps)):
             following = PHASES.noise
     elif phase == PHASES.noise:
-        end_noise(address, ROUNDS.start_std)
+        end_noise(address, ROUNDS.start_std if p[PROGRESS.attempts] == 1.0 else ROUNDS.wide_std)
         following = PHASES.refinement
     elif phase == PHASES.refinement:
         last, settled = end_round(address, steps + 1.0)
         p[PROGRESS.settled] = 1.0 if settled else 0.0
         if last:
-            following = PHASES.conclusion
+            following = PHASES.day if direction_count(plan) > 0 else PHASES.conclusion
     elif phase == PHASES.conclusion:
         following = end_conclusion(address, plan)
-    if phase >= PHASES.conclusion and following == PHASES.considered:
-        done = p[PROGRESS.steps] if phase == PHASES.considered else 0.0
-        if done * DIRECTIONS_OF_PASS >= direction_count(plan):
-            write_result(address, plan)
-            following = PHASES.done
+    elif phase == PHASES.considered:
+        end_directions(address)
+    else:
+        end_day(address)
+        following = phase + 1.0
+    if (following == PHASES.last_day and direction_count(plan) == 0) or (
+        phase == following == PHASES.considered
+        and p[PROGRESS.steps] * DIRECTIONS_OF_PASS >= direction_count(plan)
+    ):
+        write_result(address, plan)
+        following = PHASES.done
     if following != phase:
         p[PROGRESS.steps] = 0.0
     return following

@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 from ehadiag.compile.elementary import exponential, logarithm
 from ehadiag.compile.jit import brief_kernel, inlined_exact
 from ehadiag.compile.vector import array_at, packer, places, unpacker
-from ehadiag.core.actuator import MAX_CALIBRATED_PARAMETERS
 from ehadiag.core.criteria import ESTIMATION
 from ehadiag.model.plant import WALTHER_POINTS
 from ehadiag.monitor.monitor_memory import (
@@ -23,6 +22,8 @@ ONBOARD_GENES: Final = 3
 """Severities that are identified on board: Kintas, FSS, FDJ; others stay as given."""
 ONBOARD_PARAMETERS: Final = 5
 """Severities, then the offsets of spool and pressure in units of their noise."""
+ONBOARD_UNKNOWNS: Final = ONBOARD_PARAMETERS + 2
+"""With the oil's viscosity and the supply of the day, in deviations of what the sensors say."""
 ONBOARD_MODELS: Final = 1 + 2 * ONBOARD_GENES
 """Models that run side by side: at the point, and two more on each severity's axis through it;
 points of a grid, and a generation of the genetic search."""
@@ -30,6 +31,9 @@ HISTOGRAM_BINS: Final = 128
 """Of each histogram that noise and offsets are read from."""
 MATRIX_SIZE: Final = ONBOARD_PARAMETERS * ONBOARD_PARAMETERS
 """Numbers of a square matrix of all parameters, 1."""
+UNKNOWNS_MATRIX_SIZE: Final = ONBOARD_UNKNOWNS * ONBOARD_UNKNOWNS
+DIRECTIONS_OF_PASS: Final = ONBOARD_MODELS - 1 - ONBOARD_GENES
+"""Directions in which a pass has models off, 1."""
 
 
 class OnboardOutcome(NamedTuple):
@@ -137,11 +141,15 @@ class OnboardPhases(NamedTuple):
     """Judgement of noise and offsets."""
     refinement: float = 4.0
     """Rounds of the refinement."""
-    conclusion: float = 5.0
+    day: float = 5.0
+    """A calibrated unit's step with viscosity and supply of the day."""
+    conclusion: float = 6.0
     """Whether the optimum explains the recording."""
-    considered: float = 6.0
+    last_day: float = 7.0
+    """The step of the day about what is judged: unknowns that move together."""
+    considered: float = 8.0
     """What it moves by where what is held is off; then standard deviations and verdict."""
-    done: float = 7.0
+    done: float = 9.0
     """Nothing is left to compute."""
 
 
@@ -177,12 +185,18 @@ class OnboardPlaces(NamedTuple):
     """Root of the covariance of the severities."""
     believed: int
     """Variances of the severities that the last round has left."""
+    influence: int
+    """Columns of the unknowns' covariance that are of the severities."""
+    moved: int
+    """Shifts of the severities by a deviation of each direction of the pass."""
     considered: int
-    """Shift of the gradient by a deviation of each direction of what is held but not certain."""
+    """Sum of their squares by all directions of what is held but not certain."""
     noise: int
     """Noise of spool and pressure as the residuals show it, in units of the plan's."""
     normal: int
-    """Normal matrix, then the gradient."""
+    """Normal matrix, then the gradient, or its shift by the instant of sampling."""
+    pull: int
+    """Gradient of a step of the day."""
     meat: int
     """Covariance of the gradient."""
     slope: int
@@ -209,7 +223,7 @@ class ChannelSums(NamedTuple):
     """Residual of the tick before, and of the one before that."""
     earlier: float
     squares: float
-    """Capped squares of residuals."""
+    """Capped squares of residuals; in a look at the recording the sum of its samples."""
     samples: float
     gap: float
     """Ticks without a sample since the last one, and the longest such time."""
@@ -231,17 +245,15 @@ CHANNELS: Final = 3
 """Spool, pressure, position."""
 SUMS: Final = 8
 """Further sums of a pass, 1."""
-MAX_DIRECTIONS: Final = MAX_CALIBRATED_PARAMETERS + 8
-"""Directions in which what is held may be off, 1: those of a calibration, and what changes by the
-day."""
 ONBOARD: Final = OnboardPlaces(
     *places(OnboardOutcome, LibraryIdentity, OnboardProgress, MONITOR_UNIT_SIZE,
-            ONBOARD_PARAMETERS, ONBOARD_PARAMETERS + 3, ONBOARD_PARAMETERS, ONBOARD_GENES + 6,
+            ONBOARD_UNKNOWNS, ONBOARD_UNKNOWNS + 3, ONBOARD_UNKNOWNS, ONBOARD_GENES + 6,
             ONBOARD_GENES, ONBOARD_GENES, ONBOARD_GENES, ONBOARD_GENES, 2,
             ONBOARD_MODELS * (ONBOARD_GENES + 1), ONBOARD_GENES * ONBOARD_GENES, ONBOARD_GENES,
-            MAX_DIRECTIONS * ONBOARD_PARAMETERS, 2, MATRIX_SIZE + ONBOARD_PARAMETERS, MATRIX_SIZE,
-            ONBOARD_PARAMETERS, 3 * ONBOARD_GENES,
-            (ESTIMATION.correlation_lags + 1) * ONBOARD_PARAMETERS, CHANNELS * CHANNEL_SUMS, SUMS,
+            ONBOARD_GENES * ONBOARD_UNKNOWNS, DIRECTIONS_OF_PASS * ONBOARD_GENES, ONBOARD_GENES, 2,
+            UNKNOWNS_MATRIX_SIZE + ONBOARD_UNKNOWNS, ONBOARD_UNKNOWNS, UNKNOWNS_MATRIX_SIZE,
+            ONBOARD_UNKNOWNS, 3 * ONBOARD_GENES,
+            (ESTIMATION.correlation_lags + 1) * ONBOARD_UNKNOWNS, CHANNELS * CHANNEL_SUMS, SUMS,
             4 * HISTOGRAM_BINS, 4 * MATRIX_SIZE + 8 * ONBOARD_PARAMETERS,
             ONBOARD_MODELS * MONITOR_SIZE)
 )  # fmt: skip
@@ -272,6 +284,8 @@ class VerdictRules(NamedTuple):
     """Share of residuals beyond three deviations that an explained recording may have."""
     most_rms: float
     """Rms residual that it may have, in units of noise."""
+    most_excess: float
+    """Excess of the residuals over noise that it may have, 1."""
     search_outliers: float
     """Share of residuals beyond three deviations that needs no further search."""
     most_anchored: float
@@ -320,7 +334,7 @@ PLAN_TEST_SIZE: Final = 1 + 2 * PLAN_WINDOWS * PLAN_SEARCHES
 PLAN_IDENTITY: Final = MONITOR_PLAN_SIZE + len(VerdictRules._fields)
 PLAN_TESTS: Final = PLAN_IDENTITY + len(LibraryIdentity._fields)
 PLAN_DIRECTIONS: Final = PLAN_TESTS + 2 * PLAN_TEST_SIZE
-"""Place of the number of directions in which what is held may be off."""
+"""Place of the number of directions in which a calibration may be off; 0: there is none."""
 ONBOARD_PLAN_SIZE: Final = PLAN_DIRECTIONS + 1
 """Of a monitor's plan with these rules, an identity and the tests behind it, in open loop first. In
 a library the plant's constants a deviation off in each direction follow, PLANT_FIELDS numbers each;

@@ -10,7 +10,7 @@ from typing import Final
 from ehadiag.compile.elementary import exponential, logarithm, normal_cdf
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
-from ehadiag.core.criteria import ESTIMATION, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.linearisation import DIFFERENCES
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.severities import FAULT_CHANGES
@@ -21,6 +21,7 @@ from ehadiag.monitor.monitor_memory import (
     MONITOR_SIZE,
 )
 from ehadiag.onboard.onboard_memory import (
+    DIRECTIONS_OF_PASS,
     MATRIX_SIZE,
     ONBOARD,
     ONBOARD_GENES,
@@ -28,11 +29,13 @@ from ehadiag.onboard.onboard_memory import (
     ONBOARD_PARAMETERS,
     ONBOARD_PLAN_SIZE,
     ONBOARD_RUNS,
+    ONBOARD_UNKNOWNS,
     ONBOARD_VERDICT,
     PHASES,
     PLAN_DIRECTIONS,
     PROGRESS,
     REASONS,
+    UNKNOWNS_MATRIX_SIZE,
     OnboardOutcome,
     VerdictRules,
     keep_outcome,
@@ -52,6 +55,7 @@ from ehadiag.onboard.onboard_recording import (
 from ehadiag.onboard.onboard_refinement import (
     ROUNDS,
     inverse_column,
+    onboard_bounded_step,
     start_round,
 )
 from ehadiag.onboard.onboard_search import (
@@ -61,7 +65,6 @@ from ehadiag.onboard.onboard_search import (
     LARGEST_SECOND_DIFFERENCE,
     PLAN_PRESSURE_WEIGHT,
     PLAN_SPOOL_WEIGHT,
-    SEARCH,
     clear_histograms,
     count_residual,
     fitted_lines,
@@ -71,28 +74,33 @@ from ehadiag.onboard.onboard_search import (
     set_density,
     shown_excess,
     shown_noise,
+    start_model,
     start_model_by,
+    unknowns_at,
 )
 
 NOT_TESTED: Final = 30.0
 
 
 @bare_kernel
-def write_deviations(address: int, plan: Array, directions: int, reduced: float) -> int:
+def write_deviations(address: int, plan: Array, unknowns: int, reduced: float) -> int:
     """Write the deviations of the severities, see `ehadiag.identify.estimates.estimate_covariance`.
 
     Of the memory, its normal matrix (the uniform prior is added to it) with the shift of the
     gradient by the instant of sampling, the gradient's covariance, the variances that the search
-    has left, and shifts by so many directions; reduced: mean square of the residuals that count.
-    Returns 0, or 1 where there is no inverse and the deviations are those of a uniform density.
+    has left, and what directions shift; unknowns: of the matrices; reduced: mean square of the
+    residuals that count. Returns 0, or 1 where there is no inverse and the deviations are those of
+    a uniform density.
     """
     p, rules = array_at(address, (ONBOARD.end,)), verdict_rules_of(plan)
     matrix, normal, meat = (
-        square_at(address, ONBOARD.scratch),
-        square_at(address, ONBOARD.normal),
-        square_at(address, ONBOARD.meat),
+        square_at(address, ONBOARD.scratch, unknowns),
+        square_at(address, ONBOARD.normal, unknowns),
+        square_at(address, ONBOARD.meat, unknowns),
     )
-    column = parameters_at(address, ONBOARD.scratch + MATRIX_SIZE)
+    column = array_at(
+        address + BYTES_PER_NUMBER * (ONBOARD.scratch + UNKNOWNS_MATRIX_SIZE), (unknowns,)
+    )
     failed = 0
     for i in range(ONBOARD_GENES):
         normal[i, i] += 1.0 / ESTIMATION.uniform_std**2
@@ -102,18 +110,12 @@ def write_deviations(address: int, plan: Array, directions: int, reduced: float)
             failed = 1
             p[ONBOARD_GENES + i] = ESTIMATION.uniform_std
             continue
-        sandwich, considered = 0.0, 0.0
-        for j in range(ONBOARD_PARAMETERS):
-            for k in range(ONBOARD_PARAMETERS):
+        sandwich, moved = 0.0, 0.0
+        for j in range(unknowns):
+            for k in range(unknowns):
                 sandwich += column[j] * meat[j, k] * column[k]
-        for direction in range(-1, directions):
-            shift = ONBOARD.considered + direction * ONBOARD_PARAMETERS
-            if direction < 0:
-                shift = ONBOARD.normal + MATRIX_SIZE
-            moved = 0.0
-            for j in range(ONBOARD_PARAMETERS):
-                moved += column[j] * p[shift + j]
-            considered += moved * moved
+            moved += column[j] * p[ONBOARD.normal + unknowns * unknowns + j]
+        considered = moved * moved + p[ONBOARD.considered + i]
         discrepancy = rules.discrepancy_Kintas
         if i == FSS:
             discrepancy = rules.discrepancy_FSS
@@ -128,9 +130,9 @@ def write_deviations(address: int, plan: Array, directions: int, reduced: float)
 
 
 @merged
-def square_at(address: int, place: int) -> Array:
-    """Return a square matrix of all parameters, from a place of the memory on."""
-    return array_at(address + BYTES_PER_NUMBER * place, (ONBOARD_PARAMETERS, ONBOARD_PARAMETERS))
+def square_at(address: int, place: int, rows: int) -> Array:
+    """Return a square matrix, from a place of the memory on."""
+    return array_at(address + BYTES_PER_NUMBER * place, (rows, rows))
 
 
 @bare_kernel
@@ -144,7 +146,7 @@ def write_verdict(address: int, plan: Array) -> int:
     above, at_limit, hidden = 0.0, False, False
     for i in range(ONBOARD_GENES):
         hidden = hidden or not p[ONBOARD_GENES + i] < rules.most_std
-    _doubt_laws(p, channel_sums_at(address), rules)
+    excess = _doubt_laws(p, channel_sums_at(address), rules)
     friction, blind = CERTAIN, False
     if rules.exponents > 0.0:
         friction = _over_exponents(p, rules)
@@ -158,7 +160,8 @@ def write_verdict(address: int, plan: Array) -> int:
         low, high = p[i] - NORMAL_HALF_WIDTH_95 * std, p[i] + NORMAL_HALF_WIDTH_95 * std
         blind = blind or (low < rules.advisory and high > rules.limit)
     reasons = 0.0
-    if not _is_explained(o.outliers, o.spool_rms, o.pressure_rms, rules):
+    explained = _is_explained(o.outliers, o.spool_rms, o.pressure_rms, rules)
+    if not (explained and excess <= rules.most_excess):
         reasons += REASONS.unexplained
     if hidden:
         reasons += REASONS.hidden
@@ -175,8 +178,11 @@ CERTAIN, UNLIKELY_FAULT, LIKELY_FAULT = range(3)
 
 
 @inlined_exact
-def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> None:
-    """Widen the deviations, see `ehadiag.identify.prior.UnitPrior.discrepancy_covariance`."""
+def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> float:
+    """Widen the deviations, see `ehadiag.identify.prior.UnitPrior.discrepancy_covariance`.
+
+    Returns the excess of the residuals over noise.
+    """
     excess = max(shown_excess(p, 0, sums[0, REST]), shown_excess(p, 1, sums[1, REST]), 1.0)
     more = 1.0 + math.sqrt(excess - 1.0)
     clogging, friction = p[KINTAS], p[FSS]
@@ -189,6 +195,7 @@ def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> None:
         if doubt != 0.0:
             std = p[ONBOARD_GENES + i]
             p[ONBOARD_GENES + i] = math.sqrt(std * std + more * doubt * more * doubt)
+    return excess
 
 
 @inlined_exact
@@ -261,16 +268,16 @@ def _spread_scores(scores: Array, meat: Array, k: int) -> None:
     for lag in range(min(k, ESTIMATION.correlation_lags) + 1):
         weight = 1.0 - lag / (ESTIMATION.correlation_lags + 1.0)
         then = (k - lag) % (ESTIMATION.correlation_lags + 1)
-        for i in range(ONBOARD_PARAMETERS):
-            for j in range(ONBOARD_PARAMETERS):
+        for i in range(scores.shape[1]):
+            for j in range(scores.shape[1]):
                 product = scores[now, i] * scores[then, j]
                 if lag > 0:
                     product += scores[now, j] * scores[then, i]
                 meat[i, j] += weight * product
 
 
-DIRECTIONS_OF_PASS = ONBOARD_MODELS - 1 - ONBOARD_GENES
-"""Directions in which a pass has models off, 1."""
+MIN_VARIANCE = 1e-12
+"""Least variance of a severity by which a step goes, 1: where its column has no inverse."""
 MAX_STEP = 0.1
 """Largest step along a severity in such a pass, 1: a test shows no severity that is less certain.
 """
@@ -278,8 +285,15 @@ MAX_DIRECTION_CHANGE = 3.0
 """Change of a residual by a direction, in deviations, from which on it is a break-away, 1: three
 times what a considered parameter of the package may have, since a calibration's directions are
 larger than those."""
-ATTEMPTS = 1.0 + len(SEARCH.stds)
-"""Searches that there are, 1: the first approximation, then the genetic ones."""
+MAX_DAY = 20.0
+"""Largest step of viscosity and supply, in deviations, 1: there is some viscosity left."""
+DAY_MODELS = 1 + ONBOARD_GENES + ONBOARD_UNKNOWNS - ONBOARD_PARAMETERS
+"""Models of a step of the day: at the point, and one for each unknown but the offsets."""
+NEAR_OUTLIERS = FIT.max_outliers_for_search
+"""Largest share of outliers at which residuals show the noise, 1."""
+ATTEMPTS = 3.0
+"""Attempts that there are, 1: from the first approximation, over the usual sizes about where that
+leads, and from the genetic search."""
 ANCHORED_PLACE = ONBOARD.monitors + MODEL.state + ROWS.anchor_count
 USED_SQUARES, USED, UNEXPLAINED, UNEXPLAINED_SQUARES, _, LAWS, _ = range(
     ONBOARD.sums, ONBOARD.sums + 7
@@ -304,7 +318,8 @@ def start_conclusion(address: int, plan_address: int, plan: Array) -> None:
 def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
     """Add a tick, to which the models are advanced, to what judges an optimum."""
     p, sums = array_at(address, (ONBOARD.end,)), channel_sums_at(address)
-    rules, normal = verdict_rules_of(plan), square_at(address, ONBOARD.normal)
+    rules = verdict_rules_of(plan)
+    normal = square_at(address, ONBOARD.normal, ONBOARD_PARAMETERS)
     shift = parameters_at(address, ONBOARD.normal + MATRIX_SIZE)
     slope = parameters_at(address, ONBOARD.slope)
     along = array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES, 3))
@@ -345,20 +360,20 @@ def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
             continue
         p[USED_SQUARES] += r * r
         p[USED] += 1.0
-        lead = (
-            ESTIMATION.sampling_lead_std
-            * p[SPOOL_VELOCITY_PLACE]
-            * plan[PLAN_SPOOL_WEIGHT]
-            / p[ONBOARD.noise]
-            if c == 0
-            else 0.0
-        )
+        lead = _sampling_shift(p, plan) if c == 0 else 0.0
         for i in range(ONBOARD_PARAMETERS):
             scores[now, i] += slope[i] * r
             shift[i] += slope[i] * lead
             for j in range(ONBOARD_PARAMETERS):
                 normal[i, j] += slope[i] * slope[j]
-    _spread_scores(scores, square_at(address, ONBOARD.meat), k)
+    _spread_scores(scores, square_at(address, ONBOARD.meat, ONBOARD_PARAMETERS), k)
+
+
+@inlined_exact
+def _sampling_shift(p: Array, plan: Array) -> float:
+    """Change of the spool's residual by a deviation of the instant of sampling."""
+    shift = ESTIMATION.sampling_lead_std * p[SPOOL_VELOCITY_PLACE] * plan[PLAN_SPOOL_WEIGHT]
+    return float(shift / p[ONBOARD.noise])
 
 
 @inlined_exact
@@ -380,7 +395,7 @@ def _keeps_best(address: int) -> bool:
     p, sums, point = (
         array_at(address, (ONBOARD.end,)),
         channel_sums_at(address),
-        parameters_at(address, ONBOARD.point),
+        unknowns_at(address, ONBOARD.point),
     )
     score = sums[0, SQUARES] + sums[1, SQUARES]
     for c in range(2):
@@ -388,23 +403,23 @@ def _keeps_best(address: int) -> bool:
     if not score < p[PROGRESS.score]:
         return False
     p[PROGRESS.score] = score
-    for i in range(ONBOARD_PARAMETERS):
+    for i in range(ONBOARD_UNKNOWNS):
         p[ONBOARD.kept + i] = point[i]
     for c in range(2):
-        p[ONBOARD.kept + ONBOARD_PARAMETERS + c] = p[ONBOARD.noise + c]
-    p[ONBOARD.kept + ONBOARD_PARAMETERS + 2] = p[PROGRESS.settled]
+        p[ONBOARD.kept + ONBOARD_UNKNOWNS + c] = p[ONBOARD.noise + c]
+    p[ONBOARD.kept + ONBOARD_UNKNOWNS + 2] = p[PROGRESS.settled]
     return True
 
 
 @inlined_exact
 def _take_best(address: int) -> None:
     """Go back to the best optimum so far."""
-    p, point = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.point)
-    for i in range(ONBOARD_PARAMETERS):
+    p, point = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.point)
+    for i in range(ONBOARD_UNKNOWNS):
         point[i] = p[ONBOARD.kept + i]
     for c in range(2):
-        p[ONBOARD.noise + c] = p[ONBOARD.kept + ONBOARD_PARAMETERS + c]
-    p[PROGRESS.settled] = p[ONBOARD.kept + ONBOARD_PARAMETERS + 2]
+        p[ONBOARD.noise + c] = p[ONBOARD.kept + ONBOARD_UNKNOWNS + c]
+    p[PROGRESS.settled] = p[ONBOARD.kept + ONBOARD_UNKNOWNS + 2]
     set_density(p, ESTIMATION.refined_std)
 
 
@@ -412,18 +427,17 @@ def _take_best(address: int) -> None:
 def end_conclusion(address: int, plan: Array) -> float:
     """Judge an optimum; the phase that follows.
 
-    The noise is another: refine again. The recording is not explained: search wider, as long as
-    there is an attempt left; then the best optimum is the result.
+    The noise is another, near an optimum: refine again. The recording is not explained: search
+    wider, as long as there is an attempt left; then the best optimum is the result.
     """
     p, sums = array_at(address, (ONBOARD.end,)), channel_sums_at(address)
-    rules, point = verdict_rules_of(plan), parameters_at(address, ONBOARD.point)
-    attempts = p[PROGRESS.attempts]
+    rules, attempts = verdict_rules_of(plan), p[PROGRESS.attempts]
     p[PROGRESS.judged] += 1.0
-    if attempts <= ATTEMPTS and _noise_changes(p, p[PROGRESS.judged]):
+    samples, outliers = sums[0, SAMPLES] + sums[1, SAMPLES], sums[0, OUTLIERS] + sums[1, OUTLIERS]
+    near = outliers <= NEAR_OUTLIERS * samples
+    if attempts <= ATTEMPTS and near and _noise_changes(p, p[PROGRESS.judged]):
         set_density(p, ESTIMATION.refined_std)
         return PHASES.refinement
-    samples = sums[0, SAMPLES] + sums[1, SAMPLES]
-    cost, outliers = sums[0, SQUARES] + sums[1, SQUARES], sums[0, OUTLIERS] + sums[1, OUTLIERS]
     explained = (
         outliers <= rules.search_outliers * samples and p[ANCHORED_PLACE] <= rules.most_anchored
     )
@@ -431,90 +445,200 @@ def end_conclusion(address: int, plan: Array) -> float:
         best = _keeps_best(address)
         p[PROGRESS.judged] = 0.0
         p[PROGRESS.attempts] += 1.0
+        if attempts == 1.0:
+            set_density(p, ROUNDS.wide_std)
+            return PHASES.refinement
         if attempts < ATTEMPTS:
             return PHASES.search
         if not best:
             _take_best(address)
             return PHASES.conclusion
-    keep_outcome(
-        p,
-        OnboardOutcome(
-            point[0], point[1], point[2], 0.0, 0.0, 0.0,
-            point[3] / plan[PLAN_SPOOL_WEIGHT], point[4] / plan[PLAN_PRESSURE_WEIGHT],
-            0.0, 0.0, cost, samples, p[UNEXPLAINED] / max(samples, 1.0),
-            math.sqrt(p[UNEXPLAINED_SQUARES] / max(sums[0, SAMPLES], 1.0)),
-            math.sqrt(p[UNEXPLAINED_SQUARES + 1] / max(sums[1, SAMPLES], 1.0)),
-            p[ONBOARD_RUNS], p[PROGRESS.settled],
-        ),
-    )  # fmt: skip
-    return PHASES.considered
+    return PHASES.last_day
 
 
 @inlined_exact
 def direction_count(plan: Array) -> int:
-    """Directions in which what is held may be off."""
+    """Directions in which a calibration may be off."""
     return int(plan[PLAN_DIRECTIONS])
+
+
+@inlined_exact
+def _moved_by(lane: int) -> int:
+    """Which unknown a model of a step of the day has moved."""
+    return lane - 1 if lane <= ONBOARD_GENES else ONBOARD_PARAMETERS + lane - 1 - ONBOARD_GENES
+
+
+@bare_kernel
+def start_day(address: int, plan_address: int, plan: Array) -> None:
+    """Prepare models at a point, and beside it along each severity, viscosity and supply."""
+    p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
+    point, step = unknowns_at(address, ONBOARD.point), unknowns_at(address, ONBOARD.along)
+    for i in range(UNKNOWNS_MATRIX_SIZE):
+        p[ONBOARD.meat + i] = p[ONBOARD.normal + i] = 0.0
+    for i in range(ONBOARD_UNKNOWNS):
+        p[ONBOARD.normal + UNKNOWNS_MATRIX_SIZE + i] = p[ONBOARD.pull + i] = 0.0
+    for lane in range(ONBOARD_MODELS):
+        for i in range(ONBOARD_UNKNOWNS):
+            trial[i] = point[i]
+        i = _moved_by(lane)
+        if 0 < lane < DAY_MODELS:
+            step[i] = DIFFERENCES.considered_step
+            if lane <= ONBOARD_GENES:
+                width = min(math.sqrt(ROUNDS.width * p[ONBOARD.believed + i]), MAX_STEP)
+                step[i] = width if trial[i] + width <= 1.0 else -width
+            trial[i] += step[i]
+        start_model(address, plan_address, plan, lane, trial)
+        loosen_anchor(address, lane, p[ONBOARD.noise])
+
+
+@bare_kernel
+def add_day(address: int, plan: Array, k: int) -> None:
+    """Add a tick, to which the models are advanced, to the step of the day."""
+    p, slope = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.slope)
+    normal = square_at(address, ONBOARD.normal, ONBOARD_UNKNOWNS)
+    shift = unknowns_at(address, ONBOARD.normal + UNKNOWNS_MATRIX_SIZE)
+    pull = unknowns_at(address, ONBOARD.pull)
+    scores = array_at(
+        address + BYTES_PER_NUMBER * ONBOARD.scores,
+        (ESTIMATION.correlation_lags + 1, ONBOARD_UNKNOWNS),
+    )
+    now = k % (ESTIMATION.correlation_lags + 1)
+    for i in range(ONBOARD_UNKNOWNS):
+        scores[now, i] = 0.0
+    for c in range(2):
+        at, noise = ONBOARD.monitors + MONITOR.residual + c, p[ONBOARD.noise + c]
+        r = p[at] / noise
+        smooth = math.isfinite(r) and r * r < ESTIMATION.residual_cap
+        for lane in range(1, DAY_MODELS):
+            i, change = _moved_by(lane), p[at + lane * MONITOR_SIZE] / noise - r
+            smooth = smooth and abs(change) < DIFFERENCES.max_kink
+            slope[i] = change / p[ONBOARD.along + i]
+        slope[ONBOARD_GENES] = slope[ONBOARD_GENES + 1] = 0.0
+        slope[ONBOARD_GENES + c] = -1.0 / noise
+        if not smooth:
+            continue
+        lead = _sampling_shift(p, plan) if c == 0 else 0.0
+        for i in range(ONBOARD_UNKNOWNS):
+            scores[now, i] += slope[i] * r
+            pull[i] += slope[i] * r
+            shift[i] += slope[i] * lead
+            for j in range(ONBOARD_UNKNOWNS):
+                normal[i, j] += slope[i] * slope[j]
+    _spread_scores(scores, square_at(address, ONBOARD.meat, ONBOARD_UNKNOWNS), k)
+
+
+@bare_kernel
+def end_day(address: int) -> None:
+    """Step with viscosity and supply, see `ehadiag.identify.least_squares.refined_with_day`.
+
+    The severities' columns of the covariance that is left are in the memory then.
+    """
+    p, out = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
+    normal = square_at(address, ONBOARD.normal, ONBOARD_UNKNOWNS)
+    matrix = square_at(address, ONBOARD.scratch, ONBOARD_UNKNOWNS)
+    column = unknowns_at(address, ONBOARD.scratch + UNKNOWNS_MATRIX_SIZE)
+    point, pull = unknowns_at(address, ONBOARD.point), unknowns_at(address, ONBOARD.pull)
+    for i in range(ONBOARD_PARAMETERS):
+        pull[i] = 0.0  # the refinement has settled them
+    for i in range(ONBOARD_PARAMETERS, ONBOARD_UNKNOWNS):
+        normal[i, i] += 1.0
+        pull[i] += point[i]
+    if onboard_bounded_step(point, normal, pull, ONBOARD_GENES, 0.0, 1.0, matrix, column, out):
+        for i in range(ONBOARD_UNKNOWNS):
+            far = MAX_DAY if i >= ONBOARD_PARAMETERS else math.inf
+            point[i] = min(max(out[i], -far), far)
+    for i in range(ONBOARD_GENES):
+        shown = inverse_column(normal, i, matrix, column) > 0.0
+        p[ONBOARD.considered + i] = 0.0
+        for j in range(ONBOARD_UNKNOWNS):
+            p[ONBOARD.influence + i * ONBOARD_UNKNOWNS + j] = column[j] if shown else 0.0
 
 
 @bare_kernel
 def start_directions(address: int, plan_address: int, plan: Array, done: int) -> None:
     """Prepare models at the optimum, beside it along each severity, and with what is held off.
 
+    All unknowns move with a severity, so that a residual's slope is what an estimate takes of it.
     done: passes, of DIRECTIONS_OF_PASS directions each.
     """
-    p, trial = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.trial)
+    p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
     step = array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES,))
+    for i in range(DIRECTIONS_OF_PASS * ONBOARD_GENES):
+        p[ONBOARD.moved + i] = 0.0
     for lane in range(ONBOARD_MODELS):
-        for i in range(ONBOARD_PARAMETERS):
+        for i in range(ONBOARD_UNKNOWNS):
             trial[i] = p[ONBOARD.point + i]
         constants = identified_constants(plan_address, plan)
         if 0 < lane <= ONBOARD_GENES:
             i = lane - 1
-            width = min(math.sqrt(ROUNDS.width * p[ONBOARD.believed + i]), MAX_STEP)
-            step[i] = width if trial[i] + width <= 1.0 else -width
-            trial[i] += step[i]
+            column = ONBOARD.influence + i * ONBOARD_UNKNOWNS
+            variance = max(p[column + i], MIN_VARIANCE)
+            width = min(math.sqrt(ROUNDS.width * variance), MAX_STEP)
+            step[i] = (width if trial[i] + width <= 1.0 else -width) / variance
+            for j in range(ONBOARD_UNKNOWNS):
+                trial[j] += step[i] * p[column + j]
         direction = done * DIRECTIONS_OF_PASS + lane - 1 - ONBOARD_GENES
         if lane > ONBOARD_GENES and direction < direction_count(plan):
             behind = ONBOARD_PLAN_SIZE + direction * PLANT_FIELDS
             constants = plan_address + BYTES_PER_NUMBER * behind
-            for i in range(ONBOARD_PARAMETERS):
-                p[ONBOARD.considered + direction * ONBOARD_PARAMETERS + i] = 0.0
         start_model_by(address, constants, plan_address, plan, lane, trial)
         loosen_anchor(address, lane, p[ONBOARD.noise])
 
 
 @bare_kernel
-def add_directions(address: int, plan: Array, done: int) -> None:
-    """Add a tick, to which the models are advanced, to the shifts of the gradient."""
+def add_directions(address: int) -> None:
+    """Add a tick, to which the models are advanced, to what the directions move."""
     p, slope = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.slope)
-    first = done * DIRECTIONS_OF_PASS
     for c in range(2):
         at, noise = ONBOARD.monitors + MONITOR.residual + c, p[ONBOARD.noise + c]
         middle = p[at] / noise
         smooth = math.isfinite(middle) and middle * middle < ESTIMATION.residual_cap
         for i in range(ONBOARD_GENES):
             change = p[at + (1 + i) * MONITOR_SIZE] / noise - middle
-            smooth = smooth and abs(change) < DIFFERENCES.max_considered
+            smooth = smooth and abs(change) < DIFFERENCES.max_kink
             slope[i] = change / p[ONBOARD.along + i]
-        slope[ONBOARD_GENES] = slope[ONBOARD_GENES + 1] = 0.0
-        slope[ONBOARD_GENES + c] = -1.0 / noise
         if not smooth:
             continue
-        for k in range(min(DIRECTIONS_OF_PASS, direction_count(plan) - first)):
+        for k in range(DIRECTIONS_OF_PASS):
             change = p[at + (1 + ONBOARD_GENES + k) * MONITOR_SIZE] / noise - middle
             if not abs(change) < MAX_DIRECTION_CHANGE:
                 continue
-            for i in range(ONBOARD_PARAMETERS):
-                place = ONBOARD.considered + (first + k) * ONBOARD_PARAMETERS + i
-                p[place] += slope[i] * change
+            for i in range(ONBOARD_GENES):
+                p[ONBOARD.moved + k * ONBOARD_GENES + i] += slope[i] * change
+
+
+@bare_kernel
+def end_directions(address: int) -> None:
+    """Take what the directions of a pass move; one that there is not moves nothing."""
+    p = array_at(address, (ONBOARD.end,))
+    for k in range(DIRECTIONS_OF_PASS):
+        for i in range(ONBOARD_GENES):
+            p[ONBOARD.considered + i] += p[ONBOARD.moved + k * ONBOARD_GENES + i] ** 2
 
 
 @bare_kernel
 def write_result(address: int, plan: Array) -> None:
-    """Write deviations and verdict."""
+    """Write estimates, deviations and verdict."""
     p, new = array_at(address, (ONBOARD.end,)), verdict_rules_of(plan).friction_new
+    sums, point = channel_sums_at(address), parameters_at(address, ONBOARD.point)
+    samples = sums[0, SAMPLES] + sums[1, SAMPLES]
+    keep_outcome(
+        p,
+        OnboardOutcome(
+            point[0], point[1], point[2], 0.0, 0.0, 0.0,
+            point[3] / plan[PLAN_SPOOL_WEIGHT], point[4] / plan[PLAN_PRESSURE_WEIGHT],
+            0.0, 0.0, sums[0, SQUARES] + sums[1, SQUARES], samples,
+            p[UNEXPLAINED] / max(samples, 1.0),
+            math.sqrt(p[UNEXPLAINED_SQUARES] / max(sums[0, SAMPLES], 1.0)),
+            math.sqrt(p[UNEXPLAINED_SQUARES + 1] / max(sums[1, SAMPLES], 1.0)),
+            p[ONBOARD_RUNS], p[PROGRESS.settled],
+        ),
+    )  # fmt: skip
     write_deviations(
-        address, plan, direction_count(plan), p[USED_SQUARES] / max(p[USED] - ONBOARD_PARAMETERS, 1)
+        address,
+        plan,
+        ONBOARD_UNKNOWNS if direction_count(plan) > 0 else ONBOARD_PARAMETERS,
+        p[USED_SQUARES] / max(p[USED] - ONBOARD_PARAMETERS, 1),
     )
     p[FSS], p[ONBOARD_GENES + FSS] = (
         (p[FSS] - new) / (1.0 - new),

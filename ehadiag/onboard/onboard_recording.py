@@ -87,6 +87,7 @@ def look_at_tick(address: int, plan: Array, ticks: Array, k: int) -> None:
             continue
         sums[c, GAP] = 0.0
         sums[c, SAMPLES] += 1.0
+        sums[c, SQUARES] += value
         sums[c, LEAST], sums[c, MOST] = min(sums[c, LEAST], value), max(sums[c, MOST], value)
         if value <= low or value >= high:
             sums[c, CUT] += 1.0
@@ -130,13 +131,21 @@ def test_place(unit: Array) -> int:
 def end_look(address: int, plan: Array, count: int) -> float:
     """Take the offsets from the sensors at rest, if that was long enough; why there is no verdict.
 
-    The first approximation begins without spool friction.
+    In closed loop friction may hold the spool beside its middle before the command moves. The jack
+    comes back, so that the mean of the whole test is near the offset. The first approximation
+    begins without spool friction.
     """
     p, sums = array_at(address, (ONBOARD.end,)), channel_sums_at(address)
+    unit = array_at(address + BYTES_PER_NUMBER * ONBOARD.unit, (MONITOR_UNIT_SIZE,))
+    held = False
     for c in range(2):
         weight = plan[PLAN_SPOOL_WEIGHT] if c == 0 else plan[PLAN_PRESSURE_WEIGHT]
+        rest = sums[c, REST] / max(sums[c, RESTED], 1.0) * weight
+        mean = sums[c, SQUARES] / max(sums[c, SAMPLES], 1.0) * weight
+        if c == 0:
+            held = unit[UNIT_CLOSED] != 0.0 and abs(rest - mean) > SEARCH.most_held
         if sums[c, RESTED] >= SEARCH.min_rest_samples:
-            p[ONBOARD.point + ONBOARD_GENES + c] = sums[c, REST] / sums[c, RESTED] * weight
+            p[ONBOARD.point + ONBOARD_GENES + c] = mean if held else rest
     for i in range(ONBOARD_GENES):
         p[ONBOARD.centre + i] = 0.0
     return recording_reasons(address, plan, count)

@@ -14,15 +14,17 @@ from ehadiag.compile.elementary import exponential, logarithm
 from ehadiag.compile.jit import Array, bare_kernel
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.criteria import ESTIMATION, REFINEMENT
-from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE
+from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE, MANY_UNKNOWNS_SCHEDULE
+from ehadiag.model.parameter import USUAL
 from ehadiag.onboard.onboard_memory import (
     MATRIX_SIZE,
     ONBOARD,
     ONBOARD_GENES,
     ONBOARD_PARAMETERS,
+    PROGRESS,
     SUMS,
 )
-from ehadiag.onboard.onboard_search import fitted_lines, parameters_at, start_models
+from ehadiag.onboard.onboard_search import fitted_lines, parameters_at, start_models, unknowns_at
 
 MIN_PIVOT = 1e-300
 """Least pivot of a matrix with an inverse, 1."""
@@ -173,12 +175,19 @@ class RoundRules(NamedTuple):
     """Rounds of the refinement on board; `ehadiag.identify.posterior.SearchSchedule` on the
     host."""
 
-    most: int = 16
+    most: float = 16.0
     """Largest number of rounds, 1."""
     full: float = 8.0
     """Rounds that are taken in full, 1; more of them than on the host, which begins nearer."""
     start_std: float = 0.01
     """Standard deviation of a severity about the first approximation, 1."""
+    wide_std: float = USUAL.severity_std
+    """The same after an attempt that does not explain the recording: offset and friction of the
+    spool begin far off together where it does not rest in its middle."""
+    wide_rounds: float = float(MANY_UNKNOWNS_SCHEDULE.most_rounds)
+    """Largest number of rounds of such an attempt, 1; all are taken in full."""
+    wide_ratio: float = MANY_UNKNOWNS_SCHEDULE.least_ratio
+    """Least ratio of widths in a round of it, 1."""
     settled_ratio: float = FEW_UNKNOWNS_SCHEDULE.settled_ratio
     """Least ratio of widths of a round at convergence, 1."""
     settled_step: float = FEW_UNKNOWNS_SCHEDULE.settled_step
@@ -218,8 +227,8 @@ def start_round(address: int, plan_address: int, plan: Array) -> None:
         address,
         plan_address,
         plan,
-        parameters_at(address, ONBOARD.point),
-        parameters_at(address, ONBOARD.trial),
+        unknowns_at(address, ONBOARD.point),
+        unknowns_at(address, ONBOARD.trial),
         array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES, 3)),
     )
 
@@ -251,12 +260,12 @@ def add_lines(address: int, ticks: Array, k: int) -> None:
 
 
 @bare_kernel
-def _narrow(address: int, excess: float, linear: bool, rounds: float) -> tuple[float, float]:
+def _narrow(address: int, excess: float, least: float, part: float) -> tuple[float, float]:
     """Step and narrow the density: the least ratio of its widths, the step's length.
 
-    The ratio is negative where there is no step. Of late rounds a share is taken.
+    The ratio is negative where there is no step. least: ratio that is kept; part: how many times a
+    whole round this one is of, 1 or more.
     """
-    part = 1.0 + max(rounds - ROUNDS.full, 0.0)
     normal = array_at(
         address + BYTES_PER_NUMBER * ONBOARD.normal, (ONBOARD_PARAMETERS, ONBOARD_PARAMETERS)
     )
@@ -315,7 +324,7 @@ def _narrow(address: int, excess: float, linear: bool, rounds: float) -> tuple[f
             spread[i, j] = ROUNDS.width * max(excess, 1.0) * column[i]
     transformed_3x3(inverse, spread, axes)
     eigenvectors_3x3(spread, axes)
-    least, narrowest = ROUNDS.min_linear_ratio if linear else ROUNDS.min_ratio, 1.0
+    narrowest = 1.0
     for j in range(ONBOARD_GENES):
         ratio = math.sqrt(max(spread[j, j], 0.0))
         narrowest = min(narrowest, ratio)
@@ -338,10 +347,15 @@ def end_round(address: int, done: float) -> tuple[bool, bool]:
     p = array_at(address, (ONBOARD.end,))
     excess = p[LEFT] / max(p[WEIGHED], 1.0)
     linear = p[JUMPED] < REFINEMENT.max_nonlinear_share * max(p[COUNTED], 1.0)
-    ratio, step = _narrow(address, excess, linear, done)
+    most, full, least = ROUNDS.most, ROUNDS.full, ROUNDS.min_ratio
+    if p[PROGRESS.attempts] > 1.0:
+        most, full, least = ROUNDS.wide_rounds, ROUNDS.wide_rounds, ROUNDS.wide_ratio
+    if linear:
+        least = ROUNDS.min_linear_ratio
+    ratio, step = _narrow(address, excess, least, 1.0 + max(done - full, 0.0))
     settled = ratio > ROUNDS.settled_ratio and step < ROUNDS.settled_step
-    if done >= ROUNDS.most:
+    if done >= most:
         settled = ratio > ROUNDS.settled_ratio and step < REFINEMENT.max_mean_step * (
-            1.0 + ROUNDS.most - ROUNDS.full
+            1.0 + most - full
         )
-    return settled or ratio < 0.0 or done >= ROUNDS.most, settled
+    return settled or ratio < 0.0 or done >= most, settled

@@ -17,6 +17,7 @@ from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.criteria import ESTIMATION, FIT, REFINEMENT
 from ehadiag.identify.compact_ga import CompactGaState, draw_generation, update_state
+from ehadiag.identify.prior import DAILY_PRIORS
 from ehadiag.identify.staged_search import SEARCH_STAGES
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.sensors import read_pressure
@@ -41,9 +42,12 @@ from ehadiag.onboard.onboard_memory import (
     ONBOARD_MODELS,
     ONBOARD_PARAMETERS,
     ONBOARD_PLAN_SIZE,
+    ONBOARD_UNKNOWNS,
     PLAN_DIRECTIONS,
     UNIT_PRESSURE_OFFSET,
     UNIT_SPOOL_OFFSET,
+    UNIT_SUPPLY,
+    UNIT_VISCOSITY,
     verdict_rules_of,
 )
 
@@ -55,6 +59,10 @@ ANCHOR_LARGE_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_la
 HALVINGS_PLACE = MONITOR.settings + MonitorSettings._fields.index("halvings")
 KINTAS, FSS, FDJ = range(ONBOARD_GENES)
 """Places of the severities."""
+VISCOSITY_STD, SUPPLY_STD = (
+    DAILY_PRIORS[name].std for name in ("oil_viscosity", "supply_pressure")
+)
+"""Deviations of what the sensors say, relative and Pa."""
 
 
 class SeverityGrid(NamedTuple):
@@ -89,13 +97,17 @@ class OnboardSearchRules(NamedTuple):
     """Least noise, in units of the plan's: a converter's rounding alone makes more."""
     min_rest_samples: float = float(ESTIMATION.min_rest_samples)
     """Least number of samples at rest from which an offset is taken, 1."""
+    most_held: float = 20.0
+    """Distance of the spool at rest from its mean in closed loop, in units of the plan's noise,
+    from which on it is held beside its middle: of seven units the mean was within 9 of the offset,
+    and a spool that was held up to 230 off."""
     run_in_s: float = SEARCH_STAGES.first_run_in_s
     """Run-in before a window, s."""
-    stds: tuple[float, ...] = (0.1, 0.4)
-    """Standard deviations of a severity at the start of each genetic search, 1: those of the
-    further attempts in `ehadiag.identify`."""
+    std: float = 0.4
+    """Standard deviation of a severity at the start of the genetic search, 1: that of the last
+    attempt in `ehadiag.identify`."""
     generations: int = 40
-    """Largest number of generations of each, 1."""
+    """Largest number of generations, 1."""
     virtual_population: float = 42.0
     """Size of the population that the probability vector stands for, 1."""
     tolerance: float = 1e-4
@@ -120,6 +132,12 @@ COSTS = ONBOARD.population + ONBOARD_MODELS * ONBOARD_GENES
 def parameters_at(address: int, place: int) -> Array:
     """Return one number for each parameter, from a place of the memory on."""
     return array_at(address + BYTES_PER_NUMBER * place, (ONBOARD_PARAMETERS,))
+
+
+@merged
+def unknowns_at(address: int, place: int) -> Array:
+    """Return one number for each unknown, from a place of the memory on."""
+    return array_at(address + BYTES_PER_NUMBER * place, (ONBOARD_UNKNOWNS,))
 
 
 @inlined_exact
@@ -154,9 +172,13 @@ def start_model_by(
         unit[i] = min(max(point[i], 0.0), 1.0)
     unit[UNIT_SPOOL_OFFSET] = point[ONBOARD_GENES] / plan[PLAN_SPOOL_WEIGHT]
     unit[UNIT_PRESSURE_OFFSET] = point[ONBOARD_GENES + 1] / plan[PLAN_PRESSURE_WEIGHT]
+    viscosity, supply = unit[UNIT_VISCOSITY], unit[UNIT_SUPPLY]
+    unit[UNIT_VISCOSITY] = viscosity * (1.0 + VISCOSITY_STD * point[ONBOARD_PARAMETERS])
+    unit[UNIT_SUPPLY] = supply + SUPPLY_STD * point[ONBOARD_PARAMETERS + 1]
     state = address + BYTES_PER_NUMBER * ONBOARD.unit
     model = monitor_at(address, lane)
     wrong = int(prepare_monitor_by(model, constants_address, plan_address, state))
+    unit[UNIT_VISCOSITY], unit[UNIT_SUPPLY] = viscosity, supply
     array_at(model, (MONITOR_SIZE,))[HALVINGS_PLACE] = 1.0
     return wrong
 
@@ -179,7 +201,7 @@ def start_models(
     axes, from the mean of the three.
     """
     p = array_at(address, (ONBOARD.end,))
-    for i in range(ONBOARD_PARAMETERS):
+    for i in range(ONBOARD_UNKNOWNS):
         trial[i] = point[i]
     start_model(address, plan_address, plan, 0, trial)
     for i in range(ONBOARD_GENES):
@@ -353,12 +375,12 @@ def grid_point(p: Array, grid: int, index: int) -> float:
 @bare_kernel
 def start_grid(address: int, plan_address: int, plan: Array, grid: int, done: int) -> None:
     """Prepare all models at the next points of a grid; done: its passes so far."""
-    p, trial = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.trial)
+    p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
     severity = GRID_SEVERITIES[grid]
     if done == 0:
         p[CENTRE_BEST] = p[CENTRE_LEFT] = p[CENTRE_RIGHT] = p[CENTRE_LAST] = math.inf
         p[CENTRE_BEFORE] = 0.0
-    for i in range(ONBOARD_PARAMETERS):
+    for i in range(ONBOARD_UNKNOWNS):
         trial[i] = p[ONBOARD.centre + i] if i < ONBOARD_GENES else p[ONBOARD.point + i]
     for lane in range(ONBOARD_MODELS):
         trial[severity] = grid_point(p, grid, done * ONBOARD_MODELS + lane)
@@ -451,22 +473,20 @@ def _search_state(address: int) -> CompactGaState:
 
 
 @bare_kernel
-def start_generation(
-    address: int, plan_address: int, plan: Array, generation: int, std: float
-) -> None:
+def start_generation(address: int, plan_address: int, plan: Array, generation: int) -> None:
     """Draw a generation and prepare its models; the first about the best point."""
-    p, trial = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.trial)
+    p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
     population = array_at(
         address + BYTES_PER_NUMBER * ONBOARD.population, (ONBOARD_MODELS, ONBOARD_GENES)
     )
     if generation == 0:
         for i in range(ONBOARD_GENES):
             p[ONBOARD.mean + i] = p[ONBOARD.elite + i] = p[ONBOARD.point + i]
-            p[ONBOARD.spread + i] = std
+            p[ONBOARD.spread + i] = SEARCH.std
         p[ONBOARD.generator], p[ONBOARD.generator + 1] = math.inf, 0.0
     draw_generation(_search_state(address), population)
     for lane in range(ONBOARD_MODELS):
-        for i in range(ONBOARD_PARAMETERS):
+        for i in range(ONBOARD_UNKNOWNS):
             trial[i] = p[ONBOARD.point + i]
         for i in range(ONBOARD_GENES):
             if generation == 0 and lane == 0:
@@ -501,7 +521,7 @@ def end_generation(address: int, generation: int) -> bool:
 def start_noise(address: int, plan_address: int, plan: Array) -> None:
     """Prepare the first model at the best point, not re-anchored, to judge noise and offsets."""
     p = array_at(address, (ONBOARD.end,))
-    start_model(address, plan_address, plan, 0, parameters_at(address, ONBOARD.point))
+    start_model(address, plan_address, plan, 0, unknowns_at(address, ONBOARD.point))
     loosen_anchor(address, 0, math.inf)
     clear_histograms(p)
 

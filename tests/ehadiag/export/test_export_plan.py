@@ -8,7 +8,6 @@ from exported import short_test
 from ehadiag import ConfigurationError, default_actuator
 from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
 from ehadiag.export.library import identity_of, library_plan, uncertain_constants, verdict_rules
-from ehadiag.identify.prior import DAILY_PRIORS
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.registry import unit_constants
 from ehadiag.monitor.plan import design_cusum
@@ -66,9 +65,9 @@ def test_another_actuator_and_another_test_have_another_digest():
 
 
 def test_what_a_calibration_is_not_certain_of_is_in_the_plan():
-    """One direction for each column of the root, and one for what changes by the day."""
+    """One direction for each column of the root."""
     rows, base = np.array(uncertain_constants(CALIBRATED)), np.array(unit_constants(CALIBRATED))
-    assert len(rows) == 2 + len(DAILY_PRIORS)
+    assert len(rows) == 2
     fields = unit_constants(CALIBRATED)._fields
     bias, stiffness = fields.index("IB"), fields.index("KF")
     moved = rows - base

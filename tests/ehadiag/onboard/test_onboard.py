@@ -107,8 +107,8 @@ def test_however_it_is_sliced_the_result_is_the_same():
     assert identified("healthy-closed.blf", (700.0, 333.0, 20_000.0)) == whole
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.9998])
-@pytest.mark.parametrize("log", ["paper-open-1.blf", "paper-closed-1.blf"])
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.9, 0.9998])
+@pytest.mark.parametrize("log", sorted(TRUTH))
 def test_a_test_cut_short_is_refused(log, share):
     ticks = begun(log)[0]
     refused_for(log, REASONS.length, ticks[: math.floor(share * len(ticks))])

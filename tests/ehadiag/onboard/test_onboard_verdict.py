@@ -102,20 +102,20 @@ def test_the_deviations_are_those_of_the_package():
         3.0 * rows @ rows.T,
         rng.standard_normal(ONBOARD_PARAMETERS),
     )
-    directions, believed = rng.standard_normal((2, ONBOARD_PARAMETERS)), np.array([0.0, 0.0, 1e-4])
+    considered, believed = np.array([1e-4, 2e-4, 0.0]), np.array([0.0, 0.0, 1e-4])
     memory = np.zeros(ONBOARD.end)
     for place, numbers in (
         (ONBOARD.normal, normal), (ONBOARD.normal + normal.size, shift), (ONBOARD.meat, meat),
-        (ONBOARD.considered, directions), (ONBOARD.believed, believed),
+        (ONBOARD.considered, considered), (ONBOARD.believed, believed),
     ):  # fmt: skip
         memory[place : place + numbers.size] = numbers.ravel()
-    assert onboard_optimum.write_deviations(memory.ctypes.data, PLAN, 2, 1.3) == 0
+    assert onboard_optimum.write_deviations(memory.ctypes.data, PLAN, ONBOARD_PARAMETERS, 1.3) == 0
     inverse = np.linalg.inv(normal + np.diag([12.0] * ONBOARD_GENES + [0.0] * 2))
     sandwich = inverse @ meat @ inverse
     curved = inverse * 1.3 / ESTIMATION.capped_variance
     variance = np.maximum(np.diag(curved), np.diag(sandwich))[:ONBOARD_GENES]
-    moved = inverse @ np.vstack([shift, directions]).T
-    variance = np.maximum(variance, believed) + (moved**2).sum(axis=1)[:ONBOARD_GENES]
+    moved = (inverse @ shift)[:ONBOARD_GENES]
+    variance = np.maximum(variance, believed) + moved**2 + considered
     expected = np.sqrt(variance + ESTIMATION.discrepancy_std**2)
     assert memory[ONBOARD_GENES : 2 * ONBOARD_GENES] == pytest.approx(expected, rel=1e-9)
 
@@ -242,6 +242,31 @@ def test_surroundings_that_cannot_be_are_refused(around):
     unit = np.full(8, 3.0)
     assert set_environment(unit.ctypes.data, around) == 1
     assert (unit == 3.0).all()
+
+
+def test_a_spool_that_friction_holds_beside_its_middle_is_no_offset():
+    """In closed loop, with the position's sensor off: the spool rests 60 LSB from its offset."""
+    severities = {"Kintas": 0.4377, "FSS": 0.6481, "FDJ": 0.5719}
+    offsets = (-20.15, -1.76, 19.86, -19.45)
+    recording = simulate_test("closed", offsets_lsb=offsets, seed=1, **severities)
+    code, memory = run(surrounded(recording), ticks_of(recording), 1e9)
+    assert code == 0
+    found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+    assert found.verdict == 10.0
+    for value, std, true in zip(found[:3], found[3:6], severities.values(), strict=True):
+        assert abs(value - true) < 4.0 * std
+    assert found.runs < 400.0
+
+
+def test_an_effect_that_the_library_does_not_know_is_refused():
+    """Friction would stand in for hysteresis, 210 of its deviations off."""
+    recording = simulate_test(
+        "open", Kintas=0.9378, FSS=0.0244, FDJ=0.9364, hysteresis=0.002, seed=4
+    )
+    code, memory = run(surrounded(recording), ticks_of(recording), 1e9)
+    assert code == 0
+    found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+    assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.unexplained)
 
 
 RECORDING = read_recording(LOGS / "paper-open-1.blf")

@@ -407,7 +407,7 @@ class UnitCase:
 def perform_unit(case: UnitCase) -> Record:
     """Draw a unit, record it, identify, and compare with the truth; fractions of 1."""
     unit, faults = draw_unit(case)
-    actuator, reasons = _knowledge(case)
+    actuator, reasons = knowledge(case)
     experiments = []
     for name in TESTS[case.test]:
         recording = record_worn(case, unit, name, faults)
@@ -459,7 +459,7 @@ def _noise(*key: int) -> int:
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
-def _knowledge(case: UnitCase) -> tuple[Actuator, tuple[str, ...]]:
+def knowledge(case: UnitCase) -> tuple[Actuator, tuple[str, ...]]:
     """What the identification is given of a unit, and why its calibration was refused."""
     if case.data in ("known", "textbook") or case.nuisances == NuisanceMode.NONE.value:
         return default_actuator(), ()

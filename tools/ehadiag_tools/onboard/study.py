@@ -8,15 +8,20 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
+from dataclasses import replace as replaced
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import default_actuator
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
+from ehadiag.compile.libraries import LEVELS, processor_level
+from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.export.library import (
@@ -27,14 +32,14 @@ from ehadiag.export.library import (
     exported_unit,
     library_plan,
 )
-from ehadiag.export.targets import find_target
-from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.identification_session import NuisanceMode, identify
+from ehadiag.export.targets import Target, find_target
+from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD as PLACES
 from ehadiag.onboard.onboard_memory import OnboardOutcome
-from ehadiag_tools.accuracy.cases import UnitCase, draw_unit, record_worn
-from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, is_answered
+from ehadiag_sim.conditions import Effects
+from ehadiag_tools.accuracy.cases import UnitCase, draw_unit, knowledge, record_worn
+from ehadiag_tools.accuracy.figures import accuracy_table, is_answered
 from ehadiag_tools.onboard.replay import (
     EMULATED,
     identified,
@@ -44,11 +49,13 @@ from ehadiag_tools.onboard.replay import (
     ticks_of,
     unit_of,
 )
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.simulator.units import Unit, add_group
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import RESULT_MODE, Folder
+from firmware_iface.recording import Recording
 from firmware_iface.signals.recordings import read_recording
-from firmware_iface.stored_test import resolve_test
+from firmware_iface.stored_test import bundled_tests
 
 SEVERITIES = (0.3, 0.4, 0.2)
 """Severities that the monitor has, 1."""
@@ -80,10 +87,14 @@ def _work() -> tempfile.TemporaryDirectory[str]:
 @cache
 def _export(name: str) -> Path:
     """Export of the reference actuator for a target."""
-    out = Path(_work().name) / name
-    out.mkdir()
+    return _exported(default_actuator(), find_target(name))
+
+
+def _exported(actuator: Actuator, target: Target) -> Path:
+    """Export of an actuator for a target, in a new folder."""
+    out = Path(tempfile.mkdtemp(dir=_work().name))
     with Folder.at(out, RESULT_MODE) as folder:
-        export_library(default_actuator(), find_target(name), folder)
+        export_library(actuator, target, folder)
     return out
 
 
@@ -94,7 +105,7 @@ def _reference(name: str) -> str:
 def perform(case: OnboardCase) -> Record:
     """Run a recording through the export of a target and of its reference."""
     export = Path(case.export) if case.export else _export(case.target)
-    reference = replace(case, target=_reference(case.target), export="")
+    reference = replaced(case, target=_reference(case.target), export="")
     if _manifest(export)["plan"] != _manifest(_export(reference.target))["plan"]:
         raise ConfigurationError("--into: an export of another actuator than the reference")
     found = _run(export, case)
@@ -219,8 +230,6 @@ ONBOARD = Study(
 )  # fmt: skip
 
 
-UNTESTED = 30.0
-"""Verdict of an identification that carries none."""
 GOES_ON = 1
 """What a slice returns before the last one."""
 FAR_OFF = 5.0
@@ -228,67 +237,107 @@ FAR_OFF = 5.0
 TESTS = ("open", "closed")
 SLICE = 1e5
 """Ticks of a model in a slice, 1: seldom enough to cost nothing."""
-PLAN = library_plan(
-    default_actuator(),
-    design_cusum(FALSE_ALARM_INTERVAL_H, 1.0 / default_actuator().controller.rate),
-)
+UNKNOWN = {
+    "bias": Unit(effects=Effects(null_bias=1e-5)),
+    "hysteresis": Unit(effects=Effects(hysteresis=0.002)),
+}
+"""Units with one effect that a library of the reference actuator knows nothing of."""
+DATA = ("textbook", "calibrated", *UNKNOWN)
+"""What the units are: without effects; with many, calibrated; with one that is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class OnboardUnit:
-    """Unit `case` of a seed, recorded in a stored test."""
+    """Unit `case` of a seed, recorded in a stored test.
+
+    Data: one of `DATA`. Groups: of effects of a calibrated one, see `random_unit`. Bits: whether
+    the builds of the kernels for this computer are compared.
+    """
 
     test: str
     case: int
     seed: int
+    data: str = "textbook"
+    groups: tuple[str, ...] = ()
+    bits: bool = False
 
 
-@cache
-def _library() -> ctypes.CDLL:
-    """Export of the reference actuator, one for each process."""
-    return ctypes.CDLL(str(_export("host") / SHARED_LIBRARY_FILE))
+class OnboardLibrary:
+    """Shared library of an actuator, and its plan."""
+
+    def __init__(self, actuator: Actuator, target: Target) -> None:
+        self.actuator = actuator
+        self.code = ctypes.CDLL(str(_exported(actuator, target) / SHARED_LIBRARY_FILE))
+        tick = 1.0 / actuator.controller.rate
+        self.plan = library_plan(actuator, design_cusum(FALSE_ALARM_INTERVAL_H, tick))
+
+    def call(self, name: str, *arguments: NDArray[np.float64]) -> int:
+        """Call a function of the library with pointers to these numbers."""
+        pointers = [ctypes.c_void_p(item.ctypes.data) for item in arguments]
+        return int(getattr(self.code, name)(*pointers))
+
+    def identified(self, recording: Recording) -> NDArray[np.float64]:
+        """Outcome of a recording."""
+        ticks = np.ascontiguousarray(ticks_of(recording))
+        memory, given = np.zeros(PLACES.end), surrounded(recording, self.actuator)
+        slices = np.array([len(ticks), SLICE])
+        assert self.call("eha_identify_begin", memory, exported_unit(given, self.plan)) == 0
+        while self.call("eha_identify_run", memory, ticks, slices) == GOES_ON:
+            pass
+        return memory[: len(OnboardOutcome._fields)]
 
 
-def _call(name: str, *arguments: NDArray[np.float64]) -> int:
-    """Call a function of the library with pointers to these numbers."""
-    pointers = [ctypes.c_void_p(item.ctypes.data) for item in arguments]
-    return int(getattr(_library(), name)(*pointers))
+@lru_cache(maxsize=4)
+def _library(unit: UnitCase | None, build: str = "host") -> OnboardLibrary:
+    """Library of a calibrated unit, None: of the reference actuator.
 
-
-def _identified(unit: Sequence[float], ticks: NDArray[np.float64]) -> OnboardOutcome:
-    """Identify ticks, shape (n, 5), by the library."""
-    memory, given = np.zeros(PLACES.end), exported_unit(unit, PLAN)
-    rows, slices = np.ascontiguousarray(ticks), np.array([len(ticks), SLICE])
-    assert _call("eha_identify_begin", memory, given) == 0
-    while _call("eha_identify_run", memory, rows, slices) == GOES_ON:
-        pass
-    return OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+    Builds of the ground are for all that this processor has.
+    """
+    target = find_target("host")
+    if build != "host":
+        level = replace(LEVELS[processor_level()], fast=build == "fused")
+        target = replace(target, processor=level)
+    return OnboardLibrary(default_actuator() if unit is None else knowledge(unit)[0], target)
 
 
 def perform_random(case: OnboardUnit) -> Record:
-    """Identify a recording of a random textbook unit on board and by the package."""
-    drawn = UnitCase(case.test, case.case, case.seed, data="textbook")
+    """Identify a recording of a random unit on board and by the package."""
+    of_unit = case.data == "calibrated"
+    kind = "calibrated" if of_unit else "textbook"
+    drawn = UnitCase(case.test, case.case, case.seed, data=kind, groups=case.groups)
     unit, severities = draw_unit(drawn)
-    recording = record_worn(drawn, unit, case.test, severities)
+    recording = record_worn(drawn, UNKNOWN.get(case.data, unit), case.test, severities)
+    known = replaced(drawn, test=TESTS[0]) if of_unit else None
+    library = _library(known)
     begin = time.process_time()
-    found = _identified(surrounded(recording), ticks_of(recording))
-    spent = time.process_time() - begin
+    numbers = library.identified(recording)
+    spent, found = time.process_time() - begin, OnboardOutcome(*numbers.tolist())
     std = [found.std_Kintas, found.std_FSS, found.std_FDJ]
     ends = [
         (v - NORMAL_HALF_WIDTH_95 * s, v + NORMAL_HALF_WIDTH_95 * s)
         for v, s in zip(found[:3], std, strict=True)
     ]
-    assert recording.samples is not None
-    experiment = build_experiment(
-        recording.samples, recording.environment, resolve_test(case.test), default_actuator()
-    )
-    host = identify([experiment], nuisances=NuisanceMode.NONE).estimates
     out = {
         "faults": severities, "processor_s": spent, "value": found[:3], "std": std,
         "interval95": ends, "runs": found.runs, "outliers": found.outliers,
-        "verdict": NOT_TESTED if found.verdict == UNTESTED else "answered",
-        "host": [item.value for item in host], "host_std": [item.std for item in host],
+        "reasons": found.reasons, "verdict": Verdict(int(found.verdict)).name,
     }  # fmt: skip
+    if case.bits:
+        portable, fused = (
+            _library(known, build).identified(recording) for build in ("portable", "fused")
+        )
+        out["same_bits"] = portable.tobytes() == numbers.tobytes()
+        apart = np.abs(fused[:3] - numbers[:3]) / numbers[3:6]
+        out["fused"], out["fused_verdict"] = float(apart.max()), fused[8] == numbers[8]
+    else:
+        mode = NuisanceMode.NONE if case.data == "textbook" else NuisanceMode.AUTO
+        host = diagnose([recording], library.actuator, bundled_tests().values(), nuisances=mode)
+        assert host.identification is not None
+        estimates = host.identification.estimates
+        out |= {
+            "host_verdict": host.verdict.name, "host": [item.value for item in estimates],
+            "host_std": [item.std for item in estimates],
+        }  # fmt: skip
     return {name: _plain(value) for name, value in out.items()}
 
 
@@ -300,30 +349,64 @@ def _plain(value: object) -> object:
 
 
 def _random_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--test", action="append", choices=TESTS, help="may be repeated (both)")
+    add = parser.add_argument
+    add("--test", action="append", choices=TESTS, help="may be repeated (both)")
+    add("--data", action="append", choices=DATA, help="what the units are (textbook)")
+    add("--bits", action="store_true", help="compare builds for this computer, not the package")
+    add_group(parser)
 
 
 def _random_cases(options: Options) -> list[OnboardUnit]:
     return [
-        OnboardUnit(test, case, options.seed)
+        OnboardUnit(test, case, options.seed, data, tuple(sorted(set(options.group))), options.bits)
+        for data in options.data or DATA[:1]
         for case in range(options.cases)
         for test in options.test or TESTS
     ]
 
 
-def _random_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    yield from accuracy_table(records, "test")
-    answered = [item for item in records if is_answered(item)]
-    host = [_deviations(item, "host", "host_std").max() for item in answered]
+def _random_report(records: Sequence[Record], options: Options) -> Iterator[str]:
+    yield from accuracy_table(records, "data", "test")
     runs, spent = np.mean([(item["runs"], item["processor_s"]) for item in records], axis=0)
     yield f"\n{runs:.0f} model runs and {spent:.2f} s of processor a test"
-    if host:
-        yield f"from the package, deviations: median {np.median(host):.2f}, most {max(host):.2f}"
+    yield from _bits_lines(records) if options.bits else _package_lines(records)
     yield f"\nNOT TESTED, or beyond {FAR_OFF:g} deviations:\n"
     yield from markdown(
-        ("test", "case", "truth", "estimate", "outliers"),
-        ((i["test"], i["case"], _text(i["faults"]), _text(i["value"]), i["outliers"])
+        ("data", "test", "case", "truth", "estimate", "outliers", "reasons"),
+        ((i["data"], i["test"], i["case"], _text(i["faults"]), _text(i["value"]), i["outliers"],
+          i["reasons"])
          for i in records if not is_answered(i) or _is_far(i)),
+    )  # fmt: skip
+
+
+def _bits_lines(records: Sequence[Record]) -> Iterator[str]:
+    """How the ground's builds of the same kernels differ from the library."""
+    same = sum(item["same_bits"] for item in records)
+    yield f"portable build of the ground: the same bits in {same} of {len(records)}"
+    fused = [item["fused"] for item in records if item["fused"] is not None]
+    other = sum(not item["fused_verdict"] for item in records)
+    yield f"fused build: at most {max(fused, default=0.0):.2g} deviations, other verdicts {other}"
+
+
+def _package_lines(records: Sequence[Record]) -> Iterator[str]:
+    """How the package's estimates of the same recordings differ."""
+    rows = []
+    for (data, test), part in grouped(records, "data", "test").items():
+        answered = [item for item in part if is_answered(item)]
+        cells: list[str] = []
+        if answered:
+            apart = np.array([_deviations(item, "host", "std") for item in answered])
+            ratio = np.array([np.divide(item["std"], item["host_std"]) for item in answered])
+            cells += [f"{apart.mean():.2f}", f"{apart.max():.2f}"]
+            cells += [", ".join(f"{value:.2f}" for value in np.median(ratio, axis=0))]
+            cells += [", ".join(f"{value:.2f}" for value in ratio.max(axis=0))]
+        other = sum(item["verdict"] != item["host_verdict"] for item in part)
+        rows.append((data, test, len(part), len(answered), *(cells or "––––"), other))
+    yield "\nThe package beside, in deviations of the library, for Kintas, FSS, FDJ:\n"
+    yield from markdown(
+        ("data", "test", "cases", "answered", "apart, mean", "most", "deviation over its, median",
+         "most", "other verdicts"),
+        rows,
     )  # fmt: skip
 
 
@@ -342,7 +425,7 @@ def _text(values: Sequence[float | None]) -> str:
 
 ONBOARD_UNITS = Study(
     "onboard-units",
-    "Random textbook units through the exported library: NOT TESTED, errors, the package beside.",
+    "Random units through the exported library, the package or other builds beside.",
     _random_cases, perform_random, _random_report, _random_options, count=40,
     counted="random units", failed=_is_far,
 )  # fmt: skip
