@@ -136,7 +136,7 @@ def order_bytes(order: str) -> None:
 
 
 def _skip_repetition() -> None:
-    """Let numba not work out what nobody reads, or twice: over a third of its time for the same code.
+    """Let numba not work out what nobody reads, or twice: a third of its time for the same code.
 
     The variables in use after each pass, where only the last pass needs them; variables in parts of
     instructions that hold none; options, one after the other, for comparisons; for each operation
