@@ -287,10 +287,14 @@ def object_files(*wanted: ObjectFile) -> list[bytes]:
     }
     codes = {file: code for file in blank if (code := read_cached(file)) is not None}
     absent = [file for file in blank if file not in codes]
-    made = object_code(*(blank[file] for file in absent)) if absent else []
-    codes |= {
-        file: cached(file, partial(bytes, code)) for file, code in zip(absent, made, strict=True)
-    }
+    made: dict[str, bytes] = {}
+
+    def code_of(file: str) -> bytes:
+        if not made:
+            made.update(zip(absent, object_code(*map(blank.__getitem__, absent)), strict=True))
+        return made[file]
+
+    codes |= {file: cached(file, partial(code_of, file)) for file in absent}
     filled = []
     for item, (file, empty) in zip(wanted, blank.items(), strict=True):
         code = codes[file]

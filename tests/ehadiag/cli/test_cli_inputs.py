@@ -106,6 +106,7 @@ def test_a_list_says_what_it_has_no_use_for(run: Run) -> None:
     assert run("diagnose", "--list", HEALTHY).err == ""
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_more_results_may_follow_the_options_of_a_report(run: Run) -> None:
     run("diagnose", HEALTHY, "--out", ".", "--no-picture", "--json")
     shutil.copy("healthy-open.json", "b.json")
