@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ehadiag.core.actuator import WEAR_EXCESS_FACTOR
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import FIT, VERDICT
 from firmware_iface.errors import ConfigurationError
@@ -233,9 +232,11 @@ def residual_limits(calibration: Calibration | None) -> tuple[float, float]:
     fit = calibration.fit
     outliers = (FIT.outlier_factor_further_effects if further else 1.0) * FIT.max_outlier_share
     return (
-        min(outliers + WEAR_EXCESS_FACTOR * fit.outliers, FIT.max_outlier_share_poor_calibration),
         min(
-            FIT.max_rms * WEAR_EXCESS_FACTOR * max(fit.spool_rms, fit.pressure_rms),
+            outliers + FIT.wear_excess_factor * fit.outliers, FIT.max_outlier_share_poor_calibration
+        ),
+        min(
+            FIT.max_rms * FIT.wear_excess_factor * max(fit.spool_rms, fit.pressure_rms),
             FIT.max_rms_poor_calibration,
         ),
     )

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from ehadiag.core.criteria import FIT
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import decode_toml, read_toml
 from firmware_iface.stored_test import Controller
@@ -38,8 +39,6 @@ MAX_CALIBRATED_PARAMETERS = 64
 MIN_ROOT_DIAGONAL = 1e-9
 MAX_NOISE_EXCESS = 1.16
 """Excess up to which a model leaves nothing (`ehadiag.identify.estimates`)."""
-WEAR_EXCESS_FACTOR = 2.0
-"""By which wear may make more of what a model leaves: friction acts on more of it."""
 
 LongText = Annotated[str, msgspec.Meta(max_length=1000)]
 ShortText = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
@@ -77,7 +76,7 @@ class FitQuality(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     @property
     def most_excess(self) -> float:
         """Excess that a later recording of the unit may have."""
-        return WEAR_EXCESS_FACTOR * self.excess
+        return FIT.wear_excess_factor * self.excess
 
 
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

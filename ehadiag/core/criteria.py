@@ -131,6 +131,8 @@ class FitCriteria(msgspec.Struct, frozen=True):
     max_rms_poor_calibration: float = 1.8
     """Largest rms residual after whatever calibration, in deviations of the noise: normal residuals
     1.8 times as large as the noise have a tenth beyond three deviations."""
+    wear_excess_factor: float = 2.0
+    """By which wear may make more of what a model leaves, 1: friction acts on more of it."""
     expected_cauchy_cost: float = 0.8618
     """Mean of Cauchy's cost that an excess is over, 1. A standard normal residual has 0.874, 1.4 %
     more; the limits of excess on this page were set with this value."""

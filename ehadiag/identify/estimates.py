@@ -15,7 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.actuator import MAX_NOISE_EXCESS, WEAR_EXCESS_FACTOR, FitQuality
+from ehadiag.core.actuator import MAX_NOISE_EXCESS, FitQuality
 from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
 from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.experiment import Experiment
@@ -169,7 +169,7 @@ def calibrated_explanation_test(fit: FitQuality) -> ExplanationTest:
     """Test whether residuals are no larger than those of a unit's calibration."""
     if not fit.left:
         return is_noise
-    most_outliers = FIT.max_outliers_of_noise + WEAR_EXCESS_FACTOR * fit.outliers
+    most_outliers = FIT.max_outliers_of_noise + FIT.wear_excess_factor * fit.outliers
     return lambda residuals: (
         residual_outlier_share(residuals) <= most_outliers
         and excess_cost(residuals) <= fit.most_excess

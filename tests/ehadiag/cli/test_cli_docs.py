@@ -24,6 +24,7 @@ from places import LOGS
 
 from ehadiag.assess import acceptance, lost_samples
 from ehadiag.cli.main import parser_and_commands
+from ehadiag.core.criteria import FIT
 from ehadiag_tools.rigs.replay import as_sent
 from ehadiag_tools.rigs.rerecord import Disturbance, ForeignBus, frames_on, logged, played
 from firmware_iface.signals.recordings import read_recording
@@ -101,8 +102,8 @@ def test_limits_are_the_documented_ones() -> None:
         f"at least {1000 * acceptance.RECORDING.min_missing_end_s:g} ms missing",
         f"converter's end | {100 * acceptance.RECORDING.max_saturated_share:g} % |",
         f"outside −{-low:g} … {high:g} °C",
-        f"more than {100 * acceptance.FIT.max_outlier_share:g} % of the residuals",
-        f"rms residual above {acceptance.FIT.max_rms:g} times",
+        f"more than {100 * FIT.max_outlier_share:g} % of the residuals",
+        f"rms residual above {FIT.max_rms:g} times",
     ):
         assert limit in page
 
