@@ -210,7 +210,7 @@ def estimate_about(
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
     )
-    profile = _profile_covariance(fine, refined) if settings.require_agreement else 0.0
+    covariance = covariance + _profile_covariance(fine, refined)
     refined = refined_with_day(fine, refined, linear)
     ambiguous = _is_hysteresis_small(refined, judged)
     if alone:
@@ -227,7 +227,7 @@ def estimate_about(
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
-        covariance=covariance + profile,
+        covariance=covariance,
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
