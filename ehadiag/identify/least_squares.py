@@ -7,6 +7,7 @@ in steps, in the last round.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -98,13 +99,13 @@ def refine_severities(
     spread: of the severities about it, shape (c,), or of each of them. between, schedule: see
     `search_posterior`.
     """
-    begin = density_about(model, start, spread)
+    begin = start_density(model, start, spread)
     nothing = np.zeros((len(begin.x), len(begin.x)))
     found = search_posterior(model, begin, begin, nothing, linearised_on_cross, schedule, between)
     return refinement_by_lines(model, found.density.x, found.linear, settled=found.settled)
 
 
-def density_about(
+def start_density(
     model: Derivatives, start: Mapping[str, float], spread: Array | float
 ) -> ParameterDensity:
     """Lay a density about a start, see `refine_severities`."""
@@ -247,15 +248,26 @@ def refined_by_step(
     )
 
 
-MAX_NEAR_ROUNDS = 3
-"""Rounds of `rest_near`, 1: a fourth would take as long as what a search saves."""
-MAX_JUMPED_ROWS = 2
-"""Rows that jump where no break-away does, 1: one a tick later moves three samples and more."""
-MIN_JUMP_SCATTER = 0.3
-"""Scatter about a line from which a row jumps, in variances: half a deviation. With 1 five of 104
-refinements ended up to 1.6 deviations from a search's estimate."""
-MAX_REST_STEP = 0.5
-"""Step of a round at rest, in deviations; with 1 one of 98 refinements ended 1.6 away."""
+class NearRules(NamedTuple):
+    """Refinement from an estimate that is nearly right (`rest_near`)."""
+
+    look_std: float = 5e-4
+    """Width of a look at an earlier estimate, 1: a wear of up to 0.002 since then is within
+    four."""
+    max_rounds: int = 3
+    """Rounds, 1: a fourth would take as long as what a search saves."""
+    max_jumped_rows: int = 2
+    """Rows that jump where no break-away does, 1: one a tick later moves three samples and more."""
+    min_jump_scatter: float = 0.3
+    """Scatter about a line from which a row jumps, in variances: half a deviation. With 1 five of
+    104 refinements ended up to 1.6 deviations from a search's estimate."""
+    max_step: float = 0.5
+    """Step of a round at rest, in deviations; with 1 one of 98 refinements ended 1.6 away."""
+    min_information: float = 1e-12
+    """Information on what no sample shows, in units of the scales."""
+
+
+NEAR = NearRules()
 
 
 def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> Refinement | None:
@@ -266,20 +278,20 @@ def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> 
     there the optimum depends on where a round comes from.
     """
     effects: Array | float = 0.0
-    for turn in range(MAX_NEAR_ROUNDS):
-        density = density_about(model, start, spread)
+    for turn in range(NEAR.max_rounds):
+        density = start_density(model, start, spread)
         cross = CoordinateCross.about(model, density)
         runs, considered, anchored = model.at(*cross.points, days=slice(turn, turn + 1))
         considered[model.daily] += effects
         effects = considered[model.daily]
         linear = cross.lines(model, runs)
         found = refined_by_step(model, linear, considered, anchored)
-        jumps = found.weighted & (linear.scatter > MIN_JUMP_SCATTER)
-        if np.count_nonzero(jumps) > MAX_JUMPED_ROWS:
+        jumps = found.weighted & (linear.scatter > NEAR.min_jump_scatter)
+        if np.count_nonzero(jumps) > NEAR.max_jumped_rows:
             return None
         step = np.abs((found.x - density.x) * model.scale)[model.curved]
         start, spread = found.values, near_spread(found)
-        most = MAX_REST_STEP / FEW_UNKNOWNS_SCHEDULE.width * spread
+        most = NEAR.max_step / FEW_UNKNOWNS_SCHEDULE.width * spread
         if turn > 0 and np.all(step <= most):
             return found
     return None
@@ -292,13 +304,9 @@ def near_spread(found: Refinement) -> Array:
     return np.minimum(FEW_UNKNOWNS_SCHEDULE.width * std[severities], SEARCH_OPTIMUM_STD)
 
 
-MIN_INFORMATION = 1e-12
-"""Information on what no sample shows, in units of the scales."""
-
-
 def deviations(normal: Array) -> Array:
     """Standard deviations of the estimates by their information."""
-    return np.sqrt(np.diag(np.linalg.inv(normal + MIN_INFORMATION * np.eye(len(normal)))))
+    return np.sqrt(np.diag(np.linalg.inv(normal + NEAR.min_information * np.eye(len(normal)))))
 
 
 def refined_with_day(model: Derivatives, found: Refinement, linear: LinearModel) -> Refinement:

@@ -25,10 +25,9 @@ from ehadiag.identify.experiment import (
     with_residual_noise,
 )
 from ehadiag.identify.least_squares import (
-    MIN_INFORMATION,
+    NEAR,
     SEARCH_OPTIMUM_STD,
     Refinement,
-    density_about,
     deviations,
     last_round,
     median_offsets,
@@ -36,6 +35,7 @@ from ehadiag.identify.least_squares import (
     refine_severities,
     refined_by_step,
     rest_near,
+    start_density,
 )
 from ehadiag.identify.linearisation import (
     ConsideredParameter,
@@ -54,6 +54,7 @@ from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
+from ehadiag.model.simd_layout import MAX_JACK_HALVINGS
 
 CONSIDERED_PARAMETERS = (
     ConsideredParameter(
@@ -184,14 +185,14 @@ def refine_near(
     # Its lanes are so alike that their own paths say how the jack's ticks are to be cut.
     free = SimdModel(batch, unknowns_of(experiments), levels=np.full(len(batch.spool), -1))
     model = Derivatives(free, experiments[0].noise)
-    cross = CoordinateCross.about(model, density_about(model, start, LOOK_STD))
+    cross = CoordinateCross.about(model, start_density(model, start, NEAR.look_std))
     runs = model.many(cross.points)
     at_start = StartResiduals(runs[0], median_offsets(free, runs[0]), batch.weight)
     if at_start.outlier_share > FIT.max_outliers_for_search:
         return None
     between()
     judged = _with_judged_noise(experiments, [item.ticks for item in experiments], runs[0])
-    linear, offsets = cross.lines(model, runs), density_about(model, at_start.offsets, 0.0).x
+    linear, offsets = cross.lines(model, runs), start_density(model, at_start.offsets, 0.0).x
     linear = replace(
         linear,
         x=linear.x + offsets,
@@ -199,18 +200,12 @@ def refine_near(
     )
     near = refined_by_step(model, linear, runs[:0], 0)
     # With as few halvings as they ask for, jack friction is half a deviation off, with more 0.03.
-    levels = np.minimum(free.levels + 1, MAX_JACK_LEVEL)
+    levels = np.minimum(free.levels + 1, MAX_JACK_HALVINGS)
     whole = anchored_derivatives(judged, levels=levels)
     found = rest_near(whole, near.values, near_spread(near))
     if found is None:
         return None
     return replace(found, evaluations=model.evaluations + found.evaluations), judged
-
-
-LOOK_STD = 5e-4
-"""Width of a look at an earlier estimate, 1: a wear of up to 0.002 since then is within four."""
-MAX_JACK_LEVEL = 4
-"""Most halvings of a tick of the jack, 1."""
 
 
 def anchored_derivatives(
@@ -339,7 +334,7 @@ def _last_part_step(
     stands, pulls = before @ first.residuals[first.used], now @ slope.residuals[taken]
     # At the optimum of the first part the gradient is 0, but into a bound.
     at_bound = (x == model.lower) | (x == model.upper)
-    normal = before @ before.T + now @ now.T + MIN_INFORMATION * np.eye(len(x))
+    normal = before @ before.T + now @ now.T + NEAR.min_information * np.eye(len(x))
     gradient = np.where(at_bound, stands, 0.0) + pulls
     return bounded_step(x, normal, gradient, model.lower, model.upper), normal
 
