@@ -78,8 +78,6 @@ from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
 from firmware_iface.stored_test import Line, SearchWindows, StoredTest
 
-np.empty(2**22 - 1024)  # glibc keeps blocks up to the largest one freed: no page is faulted anew
-
 
 class NuisanceMode(Enum):
     """Which effects of the installation are estimated besides the severities and the offsets."""
