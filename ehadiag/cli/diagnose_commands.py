@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -55,9 +54,6 @@ from firmware_iface.errors import (
 )
 from firmware_iface.files import write_file
 from firmware_iface.logs.log_files import FRAME_READERS
-
-if TYPE_CHECKING:
-    pass
 
 OPTIONS_UNUSED_BY_LIST = (
     "joint", "out", "report", "signals", "history", "hours", "cycles", "results", "resume",

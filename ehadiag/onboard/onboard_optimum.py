@@ -282,9 +282,9 @@ MAX_STEP = 0.1
 """Largest step along a severity in such a pass, 1: a test shows no severity that is less certain.
 """
 MAX_DIRECTION_CHANGE = 3.0
-"""Change of a residual by a direction, in deviations, from which on it is a break-away, 1: three
-times what a considered parameter of the package may have, since a calibration's directions are
-larger than those."""
+"""Change of a residual by a direction, in deviations, from which on it is a break-away, 1: a
+calibration's directions are larger than what the package considers, 0.3 for an eighth of a
+deviation."""
 MAX_DAY = 20.0
 """Largest step of viscosity and supply, in deviations, 1: there is some viscosity left."""
 DAY_MODELS = 1 + ONBOARD_GENES + ONBOARD_UNKNOWNS - ONBOARD_PARAMETERS
@@ -552,6 +552,11 @@ def end_day(address: int) -> None:
         p[ONBOARD.considered + i] = 0.0
         for j in range(ONBOARD_UNKNOWNS):
             p[ONBOARD.influence + i * ONBOARD_UNKNOWNS + j] = column[j] if shown else 0.0
+    # The rounds hold the day: what its step, by lines, has taken off an estimate counts.
+    for day in range(ONBOARD_PARAMETERS, ONBOARD_UNKNOWNS):
+        variance = inverse_column(normal, day, matrix, column)
+        for i in range(ONBOARD_GENES if variance > 0.0 else 0):
+            p[ONBOARD.considered + i] += (point[day] * column[i] / variance) ** 2
 
 
 @bare_kernel
