@@ -27,18 +27,24 @@ from ehadiag.export.library import exported_unit, library_plan
 from ehadiag.identify.estimates import FIRST_STAGE_STD, friction_range
 from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.model.plant import plant_constants, relative_viscosity
+from ehadiag.model.registry import unit_constants
+from ehadiag.monitor.monitor_memory import MONITOR_PLAN_SIZE
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard import onboard_optimum
+from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
 from ehadiag.onboard.onboard_memory import (
     ONBOARD,
     ONBOARD_GENES,
     ONBOARD_PARAMETERS,
     ONBOARD_VERDICT,
     PHASES,
+    PLAN_DIRECTIONS,
     PROGRESS,
     REASONS,
     UNIT_SUPPLY,
+    UNIT_VISCOSITY,
     OnboardOutcome,
+    VerdictRules,
     set_environment,
 )
 from ehadiag_tools.onboard.replay import surrounded, ticks_of
@@ -267,6 +273,27 @@ def test_an_effect_that_the_library_does_not_know_is_refused():
     assert code == 0
     found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
     assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.unexplained)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("off", [-3.0, -1.5, 1.5])
+def test_what_viscosity_of_the_day_moves_counts_in_the_deviation(off):
+    """Of a unit with a calibration; a healthy one's `FDJ` was 16 deviations off once."""
+    new = np.array(unit_constants(ACTUATOR), dtype=np.float64)
+    plan = np.concatenate([PLAN, *(new * (1.0 + 5e-4 * row) for row in np.eye(len(new))[:3])])
+    plan[PLAN_DIRECTIONS] = 3.0
+    plan[MONITOR_PLAN_SIZE + VerdictRules._fields.index("most_excess")] = math.inf
+    recording = read_recording(LOGS / "healthy-open.blf")
+    unit, memory = np.array(surrounded(recording)), np.zeros(ONBOARD.end)
+    unit[UNIT_VISCOSITY] /= 1.0 + 0.038 * off
+    ticks = np.ascontiguousarray(ticks_of(recording))
+    places = memory.ctypes.data, plan.ctypes.data
+    assert begin_identification(*places, unit.ctypes.data) == 0
+    assert continue_identification(*places, ticks.ctypes.data, (float(len(ticks)), 1e9)) == 0
+    found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+    assert found.verdict == 0.0
+    for value, std in zip(found[:3], found[3:6], strict=True):
+        assert value < 2.5 * std < 0.03
 
 
 RECORDING = read_recording(LOGS / "paper-open-1.blf")
