@@ -214,7 +214,8 @@ def estimate_about(
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
     )
-    covariance = covariance + _profile_covariance(fine, refined)
+    if FRICTION_NAME in refined.values:  # a calibration holds the severities
+        covariance = covariance + _profile_covariance(fine, refined)
     refined = refined_with_day(fine, refined, linear)
     ambiguous = _is_hysteresis_small(refined, judged)
     if alone:
