@@ -74,8 +74,8 @@ def soak(case: SoakCase) -> Record:
     Frames sent, received (all senders together), lost, and of them those that the socket had no
     room for (None if it cannot say) or the reader was too slow for; memory of the reader after a
     minute (or half the time) and at the end, bytes; ages of foreign frames when it has them, µs; of
-    the monitor ticks pushed, alarms, rms of the residuals over the noise, and times of a push and
-    of all work of the receive thread on a tick, µs.
+    the monitor ticks pushed, lost on the way, alarms, rms of the residuals over the noise, and
+    times of a push and of all work of the receive thread on a tick, µs.
     """
     seconds = 60.0 * case.minutes
     if not (OWN_LOAD < case.load <= 1.0 and seconds >= 1.0):
@@ -167,6 +167,7 @@ class _Sink:
             raise BusLostError("no tick arrived complete")
         return {
             "pushes": self._pushes,
+            "ticks_lost": self._ticks.lost,
             "alarms": self._alarms,
             "push_us": percentiles(self._push[part] / 1e3),
             "work_us": percentiles(self._work[part] / 1e3),

@@ -189,7 +189,7 @@ def test_the_soak_accounts_for_every_frame(tmp_path):
     )
     assert report.is_file(), done.stderr
     rows = {
-        name.strip(): [float(number) for number in re.findall(r"[\d.]+", value)]
+        name.strip(): [float(number) for number in re.findall(r"[\d.]+(?:e[+-]\d+)?", value)]
         for name, value in re.findall(r"^\| (.+?) \| (.+?) \|$", report.read_text(), re.MULTILINE)
     }
     first = {name: values[0] for name, values in rows.items() if values}
@@ -202,9 +202,8 @@ def test_the_soak_accounts_for_every_frame(tmp_path):
     assert first["pushes"] + first["ticks_lost"] <= received / 2
     assert first["alarms"] == 0
     assert first["diagnoses"] > 0
-    assert 0.0 < first["age_p50"] <= first["age_p99"]
     assert first["rss_end"] > 0
-    for name in ("push_us", "work_us"):
+    for name in ("age_us", "push_us", "work_us"):
         assert rows[name][0] > 0.0
         assert rows[name] == sorted(rows[name])
 
