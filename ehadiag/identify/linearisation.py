@@ -202,6 +202,11 @@ class Derivatives:
         out[:, : len(self.estimated)] = points * self.scale
         return out
 
+    def named(self, x: Array) -> dict[str, float]:
+        """Values of the estimated parameters at a point, SI by name."""
+        values = (x * self.scale).tolist()
+        return {item.name: value for item, value in zip(self.estimated, values, strict=True)}
+
     def _sides(self, x: Array, width: float) -> Array:
         """Points above and below x in each curved coordinate, within its bounds."""
         out = np.repeat(x[None, :], 2 * len(self.curved), axis=0)

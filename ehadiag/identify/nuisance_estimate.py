@@ -157,9 +157,8 @@ def estimate_about(
     """Estimate parameters about the end of a search, see `estimate_nuisances`."""
     model, found = staged.model, staged.found
     if found.explained:
-        names = [item.name for item in model.estimated]
-        values = dict(zip(names, (found.density.x * model.scale).tolist(), strict=True))
-        experiments = [item.with_origin(values["spool_offset"]) for item in experiments]
+        offset = model.named(found.density.x)["spool_offset"]
+        experiments = [item.with_origin(offset) for item in experiments]
     judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
     held = [item.parameter for item in considered]
 
@@ -468,8 +467,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             found = estimate_about(experiments, settings, staged, considered)
             better, doubted = self._other_exponent(experiments, found, found)
             return replace(found, better_exponent=better, exponent_doubted=doubted)
-        names = [item.name for item in staged.model.estimated]
-        values = dict(zip(names, staged.found.density.x * staged.model.scale, strict=True))
+        values = staged.model.named(staged.found.density.x)
         slow = max(
             slip_speed(item.constants, min(max(values["FDJ"], 0.0), 1.0)) for item in experiments
         )

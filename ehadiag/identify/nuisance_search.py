@@ -367,9 +367,7 @@ def _search_recordings(
             gives_up=_spool_is_unexplainable if settings.give_up else None,
             progress=settings.progress,
         )
-        values = (guided.density.x * guide.scale).tolist()
-        names = [item.name for item in guide.estimated]
-        origins = [density_about(model, first, dict(zip(names, values, strict=True))), *origins]
+        origins = [density_about(model, first, guide.named(guided.density.x)), *origins]
     found = multistart_search(
         model,
         first,

@@ -309,8 +309,7 @@ def add_last_part(
         std = deviations(first.normal)
         others, evaluations = [x], model.evaluations
         if np.any(np.abs(moved - x)[whole.faults] > GIVE_UP.max_severity_step * std[whole.faults]):
-            names = (item.name for item in whole.estimated)
-            start = dict(zip(names, (moved * whole.scale).tolist(), strict=True))
+            start = whole.named(moved)
             width = FEW_UNKNOWNS_SCHEDULE.width * (std * whole.scale)[whole.curved]
             found = refine_severities(whole, start, width, schedule=LAST_PART_SCHEDULE)
             others, moved, normal, settled = [], found.x, found.normal, found.converged
