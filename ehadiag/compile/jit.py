@@ -12,7 +12,7 @@ import ctypes
 import os
 import struct
 from collections.abc import Callable
-from functools import cached_property, update_wrapper
+from functools import cache, cached_property, update_wrapper
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -42,6 +42,7 @@ NUMBERS = {float: "d", Any: "d", int: "q", bool: "?"}
 """Letters of numbers; a law's `Any` is a number or a vector, and here a number."""
 
 
+@cache
 def kind_of(annotation: Any) -> Kind:
     """Kind of an argument with this annotation."""
     if annotation in NUMBERS:
@@ -94,8 +95,10 @@ class Kernel:
 
     @cached_property
     def _called(self) -> Callable[..., Any]:
-        if not self.is_entry or is_plain():
+        if not self.is_entry:
             return self.py_func
+        if is_plain():
+            return lambda *arguments: self.py_func(*map(_unpacked, arguments))
         code, layout, read = self._compiled
         kinds = self.kinds[0]
 
@@ -183,9 +186,41 @@ def _fill(
             slots += value.shape
             slots += value.strides
         elif isinstance(kind, tuple):
-            _fill(slots, kind[1], value, copies)
+            if isinstance(value, Packed):
+                slots += value.slots
+            else:
+                _fill(slots, kind[1], value, copies)
         else:
             slots.append(value)
+
+
+class Packed(NamedTuple):
+    """A named tuple of contiguous arrays with its slots, for an argument of many calls."""
+
+    value: Any
+    """Keeps the arrays."""
+    slots: tuple[Any, ...]
+
+
+def _unpacked(argument: Any) -> Any:
+    """Argument of a kernel that runs as it is written."""
+    return argument.value if isinstance(argument, Packed) else argument
+
+
+T = TypeVar("T", bound=tuple[Any, ...])
+
+
+def packed_argument(value: T) -> T:
+    """Work out the slots of a named tuple, to be given to kernels in its place in many calls.
+
+    TypeError where an array is not contiguous.
+    """
+    slots: list[Any] = []
+    copies: list[tuple[Array, Array]] = []
+    _fill(slots, kind_of(type(value))[1], value, copies)
+    if copies:
+        raise TypeError(f"{type(value).__name__}: need contiguous arrays")
+    return cast("T", Packed(value, tuple(slots)))
 
 
 def kernel(function: F) -> F:

@@ -148,6 +148,7 @@ class IdentificationSession:
         ready = min(_ready_stages(item) for item in experiments)
         if ready < 0:
             return
+        self._memory.is_fed = True
         experiments, self._latest_digest = self._prepared(experiments), ((), b"")
         best = start = self._first(experiments)[1]
         self.so_far = InterimEstimate("first approximation", severities_by_name(best))
@@ -438,8 +439,8 @@ class IdentificationSession:
     ) -> FirstPart:
         """Refinement on the first parts of the tests, from memory if the inputs are the same."""
         until = [first_part_ticks(item) for item in experiments]
-        return self._memory.recall(
-            self._first_part_digest(experiments, until, start),
+        return self._memory.recall_stage(
+            lambda: self._first_part_digest(experiments, until, start),
             FirstPart,
             lambda: refine_first_part(
                 experiments,

@@ -19,7 +19,6 @@ from ehadiag.identify.experiment import (
     ANCHOR_THRESHOLDS_LSB,
     Experiment,
     WindowSpans,
-    even_jack_levels,
     lay_out_spans,
     unknowns_of,
     with_residual_noise,
@@ -91,6 +90,9 @@ class StartResiduals(msgspec.Struct, frozen=True, eq=False):
     """Constant errors of the sensors, as medians show them, SI by name."""
     weight: Array
     """Shape (signals, N)."""
+    levels: NDArray[np.int64]
+    """Halvings of the jack's ticks for models nearby, shape (N,): one more than the paths that were
+    run ask for. With as few jack friction is half a deviation off, with more 0.03."""
 
     @property
     def outlier_share(self) -> float:
@@ -110,7 +112,13 @@ def start_residuals(
 ) -> StartResiduals:
     """Run the first `until` ticks of each test at severities by name."""
     free, residuals = free_run_residuals(experiments, first_part_spans(experiments, until), start)
-    return StartResiduals(residuals, median_offsets(free, residuals), free.batch.weight)
+    return _start_residuals(free, residuals)
+
+
+def _start_residuals(free: SimdModel, residuals: Array) -> StartResiduals:
+    """Residuals of a model that was run once, its ticks cut by its own paths."""
+    levels = np.minimum(free.levels + 1, MAX_JACK_HALVINGS)
+    return StartResiduals(residuals, median_offsets(free, residuals), free.batch.weight, levels)
 
 
 def refine_first_part(
@@ -129,7 +137,7 @@ def refine_first_part(
     at_start = at_start or start_residuals(experiments, until, start)
     start = {**start, **at_start.offsets}
     experiments = _with_judged_noise(experiments, until, at_start.residuals)
-    levels = anchored_model(experiments, spans).levels
+    levels = at_start.levels
     best = _refined_spans(experiments, spans, start, levels, SEARCH_OPTIMUM_STD, between)
     evaluations = 1 + best.evaluations
     for _ in range(ESTIMATION.max_noise_judgements):
@@ -152,7 +160,7 @@ def free_run_residuals(
 ) -> tuple[SimdModel, Array]:
     """A model that runs free, and its residuals at severities by name, no offsets taken off."""
     batch = lay_out_spans(experiments, spans)
-    model = SimdModel(batch, unknowns_of(experiments), levels=even_jack_levels(batch))
+    model = SimdModel(batch, unknowns_of(experiments), levels=np.full(len(batch.spool), -1))
     point = np.array([[start.get(item.name, 0.0) for item in model.unknowns.free]])
     return model, model.residuals(point)[0][0]
 
@@ -187,7 +195,7 @@ def refine_near(
     model = Derivatives(free, experiments[0].noise)
     cross = CoordinateCross.about(model, start_density(model, start, NEAR.look_std))
     runs = model.many(cross.points)
-    at_start = StartResiduals(runs[0], median_offsets(free, runs[0]), batch.weight)
+    at_start = _start_residuals(free, runs[0])
     if at_start.outlier_share > FIT.max_outliers_for_search:
         return None
     between()
@@ -199,9 +207,7 @@ def refine_near(
         residuals=linear.residuals + np.tensordot(offsets, linear.jacobian, 1),
     )
     near = refined_by_step(model, linear, runs[:0], 0)
-    # With as few halvings as they ask for, jack friction is half a deviation off, with more 0.03.
-    levels = np.minimum(free.levels + 1, MAX_JACK_HALVINGS)
-    whole = anchored_derivatives(judged, levels=levels)
+    whole = anchored_derivatives(judged, levels=at_start.levels)
     found = rest_near(whole, near.values, near_spread(near))
     if found is None:
         return None

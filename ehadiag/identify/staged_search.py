@@ -307,6 +307,8 @@ class StageMemory:
         self._results: dict[bytes, object] = {}
         self.reused = 0
         """Stages that did not have to run again."""
+        self.is_fed = False
+        """Whether a recording came in parts, so that stages may come again."""
 
     def __len__(self) -> int:
         return len(self._results)
@@ -320,6 +322,10 @@ class StageMemory:
         result = compute()
         self._results[key] = result
         return result
+
+    def recall_stage(self, key: Callable[[], bytes], kind: type[T], compute: Callable[[], T]) -> T:
+        """Return the result of a stage; of recordings that come in one piece nothing is kept."""
+        return self.recall(key(), kind, compute) if self.is_fed else compute()
 
 
 def first_approximation_ready_at(test: StoredTest) -> float:
@@ -344,8 +350,8 @@ def recalled_first_approximation(
 ) -> FirstApproximation:
     """First approximation, from memory if the inputs are the same."""
     inputs = first_approximation_inputs(experiments)
-    return memory.recall(
-        inputs_digest("first", inputs.arrays()),
+    return memory.recall_stage(
+        lambda: inputs_digest("first", inputs.arrays()),
         FirstApproximation,
         lambda: first_approximation(inputs),
     )
@@ -406,8 +412,9 @@ def _search_stage(
         SEARCH_STAGES.first_deviation * SEARCH_STAGES.narrowing**stage * SEVERITY_DEVIATION_SHARES
     )
     part = solver.with_budget(round(solver.budget * SEARCH_STAGES.budget_share / len(STAGE_SHARES)))
-    return memory.recall(
-        inputs_digest(f"search {seed} {part!r}", [*batch, np.array(unknowns.base), start, spread]),
+    inputs = [*batch, np.array(unknowns.base), start, spread]
+    return memory.recall_stage(
+        lambda: inputs_digest(f"search {seed} {part!r}", inputs),
         SearchResult,
         lambda: part.minimise(
             Objective(SimdModel(batch, unknowns, levels=even_jack_levels(batch))),

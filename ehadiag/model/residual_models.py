@@ -20,14 +20,11 @@ from ehadiag.model.batch import NO_ANCHOR, SIGNAL_ROWS, Anchor, Batch
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.registry import Unknowns
 from ehadiag.model.simd_residuals import (
-    BlockScratch,
-    block_costs,
-    block_residuals,
+    BlockRuns,
     block_scratch,
     jack_levels,
     respond,
     run_single,
-    thread_scratch,
 )
 
 
@@ -147,7 +144,7 @@ class SimdModel:
             levels = jack_levels(batch, unknowns.candidates(_lattice_points(unknowns)))
         self.levels: NDArray[np.int64] = levels
         """How the jack's ticks are cut; to find that takes half as long as to run a block."""
-        self._work = block_scratch(levels)
+        self._runs = BlockRuns(batch, block_scratch(levels))
 
     def residuals(self, points: Array) -> tuple[Array, NDArray[np.int64]]:
         """See the protocol."""
@@ -160,26 +157,24 @@ class SimdModel:
         edges = [min(count, blocks * i // threads * LANES) for i in range(threads)] + [count]
         first, *others = [slice(a, b) for a, b in pairwise(edges)]
 
-        def evaluate(part: slice, scratch: BlockScratch) -> None:
-            block_residuals(self.batch, candidates[part], scratch, out[part], anchored[part])
+        def evaluate(part: slice, runs: BlockRuns) -> None:
+            runs.residuals(candidates[part], out[part], anchored[part])
 
         if others:
             with ThreadPoolExecutor(len(others)) as pool:
-                waiting = [
-                    pool.submit(evaluate, part, thread_scratch(self._work)) for part in others
-                ]
-                evaluate(first, self._work)
+                waiting = [pool.submit(evaluate, part, self._runs.of_thread()) for part in others]
+                evaluate(first, self._runs)
                 for item in waiting:
                     item.result()
         else:
-            evaluate(first, self._work)
+            evaluate(first, self._runs)
         self.evaluations += count
         return out, anchored
 
     def costs(self, points: Array, cap: float) -> Array:
         """See the protocol."""
         out = np.empty(len(points))
-        block_costs(self.batch, self.unknowns.candidates(points), cap, self._work, out)
+        self._runs.costs(self.unknowns.candidates(points), cap, out)
         self.evaluations += len(points)
         return out
 

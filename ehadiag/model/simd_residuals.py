@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.jit import Array, Array2, Array3, kernel, merged
+from ehadiag.compile.jit import Array, Array2, Array3, kernel, merged, packed_argument
 from ehadiag.compile.vector import LANES, VECTOR_WIDTH, load, minimum, packed, store
 from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SIGNAL_ROWS, SPOOL_ROW, Batch
 from ehadiag.model.plant import PLANT_FIELDS, PlantConstants
@@ -58,7 +58,8 @@ def jack_levels(batch: Batch, scattered: Array) -> NDArray[np.int64]:
     if batch.weight[PRESSURE_ROW:].any():
         # Without weights the jack is left out, and the spool's path is all that is looked at.
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
-        block_costs(spool_only, scattered, 1.0, block_scratch(levels), np.empty(len(scattered)))
+        runs = BlockRuns(spool_only, block_scratch(levels))
+        runs.costs(scattered, 1.0, np.empty(len(scattered)))
     return levels
 
 
@@ -74,11 +75,6 @@ def block_scratch(levels: NDArray[np.int64], lanes: int = LANES) -> BlockScratch
         uncounted=np.zeros(0, dtype=np.int64),
         no_residuals=np.zeros((0, 0, 0)),
     )
-
-
-def thread_scratch(work: BlockScratch) -> BlockScratch:
-    """Scratch of another thread, with the same steps of the jack."""
-    return block_scratch(work.levels.copy())
 
 
 @packed
@@ -212,28 +208,44 @@ def run_blocks(
             anchored[first + i] = int(count)
 
 
-def block_costs(
-    batch: Batch, candidates: Array, cap: float, work: BlockScratch, out: Array
-) -> None:
-    """Summed squared weighted residuals of each candidate, each square at most `cap`: out, (n,).
+class BlockRuns:
+    """Runs of candidates over spans of recordings, LANES at a time, by one thread.
 
-    `candidates` has shape (n, tests, PLANT_FIELDS). Blocks of LANES candidates run at once.
+    What the kernel is given in each call is prepared once.
     """
-    address = work.memory.ctypes.data
-    run_blocks(batch, candidates, cap, work, address, out, work.uncounted, work.no_residuals)
 
+    def __init__(self, batch: Batch, work: BlockScratch) -> None:
+        self.batch = batch
+        self.work = work
+        self._batch = packed_argument(Batch._make(map(np.ascontiguousarray, batch)))
+        self._scratch = packed_argument(work)
+        self._address = work.memory.ctypes.data
 
-def block_residuals(
-    batch: Batch, candidates: Array, work: BlockScratch, out: Array, anchored: NDArray[np.int64]
-) -> None:
-    """Weighted residuals, measured less modelled, of every candidate: out, shape (n, signals, N).
+    def of_thread(self) -> BlockRuns:
+        """Return the runs of another thread, with the same steps of the jack."""
+        return BlockRuns(self.batch, block_scratch(self.work.levels.copy()))
 
-    `candidates` has shape (n, tests, PLANT_FIELDS). A missing sample gives 0.
-    anchored: out, how often the model was re-anchored, shape (n,).
-    """
-    out[:] = 0.0
-    address = work.memory.ctypes.data
-    run_blocks(batch, candidates, math.inf, work, address, work.no_costs, anchored, out)
+    def costs(self, candidates: Array, cap: float, out: Array) -> None:
+        """Write the summed squared weighted residuals of each candidate, each square at most `cap`.
+
+        candidates: shape (n, tests, PLANT_FIELDS); out: shape (n,).
+        """
+        run_blocks(
+            self._batch, candidates, cap, self._scratch, self._address,
+            out, self.work.uncounted, self.work.no_residuals,
+        )  # fmt: skip
+
+    def residuals(self, candidates: Array, out: Array, anchored: NDArray[np.int64]) -> None:
+        """Write weighted residuals, measured less modelled, of every candidate.
+
+        out: shape (n, signals, N), 0 of a missing sample; anchored: how often the model was
+        re-anchored, shape (n,).
+        """
+        out[:] = 0.0
+        run_blocks(
+            self._batch, candidates, math.inf, self._scratch, self._address,
+            self.work.no_costs, anchored, out,
+        )  # fmt: skip
 
 
 @kernel
