@@ -28,7 +28,6 @@ from ehadiag.identify.estimates import (
     friction_by_exponent,
     identification_result,
     independent_covariance,
-    is_pressure_misfit,
     likelihood_ratio_cost,
     over_exponents,
     refinement_outlier_share,
@@ -39,25 +38,19 @@ from ehadiag.identify.least_squares import Refinement
 from ehadiag.identify.nuisance_estimate import NuisanceEstimate, NuisanceEstimator
 from ehadiag.identify.partial_refinement import (
     FirstPart,
+    SeverityAttempt,
     StartResiduals,
     first_part_spans,
+    first_part_ticks,
+    is_current_guessed,
     refine_first_part,
     refine_near,
+    refined_attempt,
+    severities_by_name,
     start_residuals,
 )
 from ehadiag.identify.posterior import no_interruption
 from ehadiag.identify.prior import EXACT_UNIT_PRIOR, UnitPrior, basic_nuisances_of
-from ehadiag.identify.severity_estimate import (
-    NOT_SEARCHED,
-    SeverityAttempt,
-    best_further_attempt,
-    explains_recording,
-    first_part_ticks,
-    is_current_guessed,
-    refined_attempt,
-    search_full_window,
-    severities_by_name,
-)
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.staged_search import (
     STAGE_SHARES,
@@ -77,6 +70,9 @@ from ehadiag.model.registry import FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
 from firmware_iface.stored_test import Line, SearchWindows, StoredTest
+
+NOT_SEARCHED = SearchResult(np.full(len(FAULTS), np.nan), np.nan, 0, 0, np.zeros(0))
+"""Of a refinement that needed no search."""
 
 
 class NuisanceMode(Enum):
@@ -281,7 +277,7 @@ class IdentificationSession:
         progress("refinement", 0.0)
         has_inexact_data = self.prior.has_inexact_data
         alone = self.nuisances is NuisanceMode.NONE and not has_inexact_data
-        found, start, near = self._refinement_start(experiments, found, start)
+        start, near = self._refinement_start(experiments, start, found.best)
         best: SeverityAttempt | None = None
         if alone or (near and self.nuisances is NuisanceMode.AUTO and not has_inexact_data):
             best = refined_attempt(
@@ -301,21 +297,12 @@ class IdentificationSession:
             )
             freed = freeing.estimated(experiments, hint if near else None, alone_left)
         if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
-            if (
-                near
-                and refinement_outlier_share(best.refined) <= FIT.max_outliers_for_search
-                and not _misfit_is_not_of_search(freed, best)
-            ):
-                best = best_further_attempt(
-                    experiments, best, self._first_part, self.solver, self.seed, progress,
-                    time.perf_counter,
-                )  # fmt: skip
             return self._concluded_by_severities(
                 first,
                 best,
                 first.evaluations + (freed.evaluations if freed else 0),
                 freed.starts if freed else 0,
-                _timing(begin, searched_at, search_s + best.search_s),
+                _timing(begin, searched_at, search_s),
             )
         assert freed is not None
         values = freed.refined.values
@@ -358,7 +345,7 @@ class IdentificationSession:
         near = refine_near(experiments, earlier.severities, partial(progress, "refinement", 0.0))
         if near is None or not _severities_suffice(near[0]):
             return None
-        best = SeverityAttempt(NOT_SEARCHED, *near, near[0].evaluations, np.nan)
+        best = SeverityAttempt(NOT_SEARCHED, *near, near[0].evaluations)
         first = FirstApproximation({item.name: np.nan for item in FAULTS}, 0)
         timing = _timing(begin, begin, 0.0)
         found = self._concluded_by_severities(first, best, 0, 0, timing)
@@ -381,7 +368,7 @@ class IdentificationSession:
             best.experiments,
             doubt=self._discrepancy(best.refined),
             evaluations=best.evaluations + evaluations,
-            attempts=best.count + attempts,
+            attempts=1 + attempts,
             timing=timing,
         )
 
@@ -403,21 +390,15 @@ class IdentificationSession:
         )
 
     def _refinement_start(
-        self, experiments: Sequence[Experiment], found: SearchResult, start: Array
-    ) -> tuple[SearchResult, Array, bool]:
-        """Return the search, the point a refinement begins from, and whether it may explain the
-        recordings: the first approximation, which has no seed, unless only the optimum of the
-        search resembles them, or of one over the whole window where currents were guessed."""
-        for point in (start, found.best):
+        self, experiments: Sequence[Experiment], first: Array, searched: Array
+    ) -> tuple[Array, bool]:
+        """Return the point a refinement begins from, and whether it may explain the recordings: the
+        first approximation, which has no seed, unless only the optimum of the search resembles
+        them."""
+        for point in (first, searched):
             if self._resembles(experiments, point):
-                return found, point, True
-        if not any(item.trace.guessed for item in experiments):
-            return found, found.best, False
-        other = search_full_window(experiments, found, self.solver, self.seed + len(STAGE_SHARES))
-        other = replace(other, evaluations=found.evaluations + other.evaluations)
-        near = self._resembles(experiments, other.best)
-        found = other if near else replace(found, evaluations=other.evaluations)
-        return found, found.best, near
+                return point, True
+        return searched, False
 
     def _resembles(self, experiments: Sequence[Experiment], point: Array) -> bool:
         """Whether a refinement from a point may explain the recordings."""
@@ -520,7 +501,7 @@ def _severities_suffice(refinement: Refinement) -> bool:
     """Whether the severities alone explain a recording, without slow residuals, of which
     small nuisances would be the cause."""
     return (
-        explains_recording(refinement)
+        refinement_outlier_share(refinement) <= FIT.max_fit_outliers
         and excess_cost(refinement.residuals) <= FIT.max_excess_without_nuisances
     )
 
@@ -529,15 +510,6 @@ def _nuisances_explain_no_more(freed: NuisanceEstimate, alone: SeverityAttempt) 
     """Whether nuisances explain a recording no better than the severities alone do: what is left
     is none of theirs, as where guessed positions stand in for lost ones."""
     return not freed.explained and freed.excess >= excess_cost(alone.refined.residuals)
-
-
-def _misfit_is_not_of_search(freed: NuisanceEstimate | None, alone: SeverityAttempt) -> bool:
-    """Whether what the severities alone leave is not for want of a search: of the pressure, or left
-    where several searches with all effects ended."""
-    if freed is None:
-        return False
-    confirmed = freed.confirmed and not is_current_guessed(alone.refined)
-    return confirmed or is_pressure_misfit(freed.refined.residuals)
 
 
 def _ready_stages(experiment: Experiment) -> int:

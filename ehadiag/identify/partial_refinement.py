@@ -1,4 +1,6 @@
-"""Refinement on the first part of a test while it runs, and the step that its last part adds.
+"""Refinement of the severities alone, of a unit assumed to match its data file.
+
+On the first part of a test while it runs, and the step that its last part adds.
 
 The optimum of the first part stands with its normal matrix; one Gauss-Newton step on the residuals
 of the last part leads to the optimum of the whole (a measurement update of the information filter).
@@ -48,7 +50,13 @@ from ehadiag.identify.posterior import (
     bounded_step,
     no_interruption,
 )
-from ehadiag.identify.staged_search import RUN_IN_S
+from ehadiag.identify.solvers import SearchResult
+from ehadiag.identify.staged_search import (
+    RUN_IN_S,
+    STAGE_SHARES,
+    first_approximation_ready_at,
+    stage_ready_at,
+)
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, parameter
@@ -373,3 +381,59 @@ class _PartRows(msgspec.Struct, frozen=True, eq=False):
                 run += lead + item.ticks - until
             begin += item.ticks
         return cls(spans, *(np.concatenate([np.zeros(0, int), *p]) for p in (first, last, counted)))
+
+
+class SeverityAttempt(msgspec.Struct, frozen=True, eq=False):
+    """One search and its refinement."""
+
+    found: SearchResult
+    refined: Refinement
+    experiments: Sequence[Experiment]
+    """With their noise as judged."""
+    evaluations: int
+    """Of the refinement."""
+
+
+FirstPartRefinement = Callable[[Sequence[Experiment], Array, Callable[[], None]], FirstPart]
+"""Refinement on the first parts of the tests, from a start among the severities; the last argument
+is called between rounds."""
+
+
+def refined_attempt(
+    experiments: Sequence[Experiment],
+    found: SearchResult,
+    start: Array,
+    first_parts: FirstPartRefinement,
+    between: Callable[[], None] = no_interruption,
+) -> SeverityAttempt:
+    """Refine from a start after a search; what `between` raises between rounds ends it."""
+    until = [first_part_ticks(item) for item in experiments]
+    first = first_parts(experiments, start, between)
+    judged = first.judged(experiments)
+    best = add_last_part(judged, until, first)
+    if best is None:
+        ends = [item.ticks for item in experiments]
+        whole = refine_first_part(experiments, ends, first.refined.values, between)
+        judged = whole.judged(experiments)
+        best = add_last_part(judged, ends, whole)
+        assert best is not None  # no part is left that could lead away
+        best = replace(best, evaluations=best.evaluations + whole.evaluations)
+    evaluations = first.evaluations + best.evaluations
+    return SeverityAttempt(found, best, judged, evaluations)
+
+
+def is_current_guessed(refinement: Refinement) -> bool:
+    """Whether the model left the spool so often that the current was not what it went by."""
+    return refinement.anchored > FIT.max_anchor_count
+
+
+def first_part_ticks(experiment: Experiment) -> int:
+    """Ticks that some stage before has seen the end of: windows of the test, in any order."""
+    test = experiment.test
+    seconds = max(first_approximation_ready_at(test), stage_ready_at(test, len(STAGE_SHARES) - 1))
+    return min(round(seconds / experiment.tick), experiment.ticks)
+
+
+def severities_by_name(point: Array) -> dict[str, float]:
+    """Severities by name, of a point among them."""
+    return {item.name: float(value) for item, value in zip(FAULTS, point, strict=True)}

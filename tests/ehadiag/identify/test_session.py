@@ -21,9 +21,9 @@ from ehadiag.identify.least_squares import refine_severities
 from ehadiag.identify.partial_refinement import (
     add_last_part,
     anchored_derivatives,
+    first_part_ticks,
     refine_first_part,
 )
-from ehadiag.identify.severity_estimate import first_part_ticks
 from ehadiag.identify.staged_search import (
     STAGE_SHARES,
     first_approximation_ready_at,

@@ -11,13 +11,24 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from rich.console import Console
 
 import ehadiag
+from ehadiag.compile.jit import Array
 from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.least_squares import start_density
+from ehadiag.identify.linearisation import (
+    Derivatives,
+    LinearModel,
+    ParameterDensity,
+    linearised_on_cross,
+)
+from ehadiag.identify.partial_refinement import anchored_derivatives
+from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE, cauchy_cost, search_posterior
 from ehadiag.live import Snapshot
-from ehadiag.model.registry import FAULTS, Unknowns
+from ehadiag.model.registry import FAULT_NAMES, FAULTS, Unknowns
 from ehadiag.report.response_signals import sensed_response
 from ehadiag.terminal.live_view import draw_snapshot
 from ehadiag_sim.conditions import Faults
@@ -27,6 +38,11 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73")
 """Okabe and Ito's, which colour-blind people tell apart; the dashes differ too."""
 DASHES = ("-", "--", "-.")
 WORN_UNIT = Faults(Kintas=0.4, FSS=0.3, FDJ=0.5)
+ROUNDS_STD = 4e-3
+"""Deviation of each severity about the start of the drawn refinement, 1."""
+ROUND_COLOURS = ("#e69f00", "#0072b2", "#009e73", "#cc79a7", "#d55e00")
+COST_LEVELS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""Of the contours: root of the cost's rise above the optimum, 1."""
 SIGNAL_OF = {"Kintas": 0, "FSS": 0, "FDJ": 1}
 """Signal that the search for each fault compares: 0, spool; 1, pressure (method.md)."""
 
@@ -125,6 +141,58 @@ def gap_of(experiment: Experiment, severities: Faults, name: str) -> float:
     return float(np.sqrt(np.nanmean(gap**2)) / experiment.noise[SIGNAL_OF[name]])
 
 
+def _rounds(figure: Figure) -> None:
+    """Densities of a refinement's rounds, from near the truth, over the cost in their plane."""
+    experiment, (x, y) = worn_experiment(), ("Kintas", "FSS")
+    model = anchored_derivatives([experiment])
+    truth = {name: getattr(WORN_UNIT, name) for name in FAULT_NAMES}
+    densities: list[ParameterDensity] = []
+
+    def linearise(model: Derivatives, density: ParameterDensity) -> LinearModel:
+        densities.append(density)
+        return linearised_on_cross(model, density)
+
+    begin = start_density(model, {**truth, x: truth[x] + 2e-3, y: truth[y] - 1e-3}, ROUNDS_STD)
+    nothing = np.zeros((len(begin.x), len(begin.x)))
+    found = search_posterior(model, begin, begin, nothing, linearise, FEW_UNKNOWNS_SCHEDULE)
+    densities.append(found.density)
+    names = [item.name for item in model.estimated]
+    places = [names.index(x), names.index(y)]
+    middle = np.array([truth[x], truth[y]])
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    circle = np.array([np.cos(turn), np.sin(turn)])
+    axes = figure.subplots(1, 2)
+    for axis, half, shown in zip(axes, (1.2e-2, 6e-4), ((0, 1, 2), (1, 2, 3, -1)), strict=True):
+        shifts = np.linspace(-half, half, 61)
+        points = np.repeat(found.density.x[None, :], shifts.size**2, axis=0)
+        points[:, places] = middle + np.stack(np.meshgrid(shifts, shifts), -1).reshape(-1, 2)
+        costs = cauchy_cost(model.many(points)).reshape(shifts.size, -1)
+        rise = np.sqrt(costs - costs.min())
+        part = axis.contourf(
+            100.0 * shifts, 100.0 * shifts, np.maximum(rise, COST_LEVELS[0]), COST_LEVELS,
+            norm=LogNorm(), cmap="Greys",
+        )  # fmt: skip
+        for turns in shown:
+            density, number, colour = densities[turns], turns % len(densities), ROUND_COLOURS[turns]
+            root = density.root[[FAULT_NAMES.index(x), FAULT_NAMES.index(y)]]
+            edge = 100.0 * ((density.x[places] - middle)[:, None] + _axes_of(root) @ circle)
+            label = "start" if number == 0 else f"round {number}" + " (last)" * (turns < 0)
+            axis.plot(*edge, color=colour, lw=1.8, label=label)
+        axis.plot(0.0, 0.0, "+", color="#cc0000", ms=12, label="truth")
+        ends = (-100.0 * half, 100.0 * half)
+        axis.set(
+            xlabel=f"{x} less the truth, %", ylabel=f"{y} less the truth, %", xlim=ends, ylim=ends
+        )
+        axis.legend(loc="upper right", fontsize=8)
+    figure.colorbar(part, ax=axes, label="root of the rise of the cost, deviations")
+
+
+def _axes_of(root: Array) -> Array:
+    """Half axes of the ellipse of a root of a covariance, shape (2, k): columns, shape (2, 2)."""
+    turned, lengths, _ = np.linalg.svd(root, full_matrices=False)
+    return np.asarray(turned * lengths)
+
+
 def _intervals(figure: Figure) -> None:
     axes: Sequence[Axes] = figure.subplots(1, len(FAULTS))
     found = [
@@ -173,6 +241,7 @@ def _monitor(figure: Figure) -> None:
 METHOD_PICTURES: dict[str, Callable[[Figure], None]] = {
     **{name: partial(_effects, name=name) for name in EFFECTS},
     "searches": _searches,
+    "rounds": _rounds,
     "intervals": _intervals,
     "exponent": _exponent,
     "monitor": _monitor,
