@@ -439,6 +439,6 @@ def test_one_break_away_at_a_wrong_tick_leaves_noise_beside_it(events, explained
     residuals = np.random.default_rng(5).standard_normal((2, 5500))
     for event in range(events):
         start = 1190 + 2000 * event  # over the end of a block
-        residuals[:, start : start + 20] += 8.0
+        residuals[:, start : start + 25] += 60.0
     assert not is_noise(residuals)
     assert is_noise(without_event(residuals)) is explained
