@@ -353,6 +353,9 @@ class EstimationRules(NamedTuple):
     """Scale of Cauchy's cost, in deviations: larger residuals count little."""
     max_row_scatter: float = 1.0
     """Scatter about the linear model from which a sample is left out, in variances."""
+    max_informative_scatter: float = 0.03
+    """The same, for how sure an optimum is: that of a jump by 0.6 deviations, twice what is taken
+    for a break-away between two-sided differences; 0.02 on a cross, 0.033 in a regression."""
     max_noise_judgements: int = 3
     """Largest number of judgements of the noise, 1."""
     noise_tolerance: float = 0.15

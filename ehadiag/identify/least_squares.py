@@ -68,7 +68,7 @@ class Refinement(msgspec.Struct, frozen=True, eq=False):
     anchored: int
     """How often the model was re-anchored at the optimum."""
     step: Array
-    """The last one, in units of `scale`; shape (k,)."""
+    """The last one, in units of `scale`, that by oil and supply of the day aside; shape (k,)."""
     information: Array | None = None
     """What was known beforehand: inverse covariance, in units of `scale`; shape (k, k)."""
     daily: Array = msgspec.field(default_factory=lambda: np.zeros((0, 0, 0)))
@@ -143,7 +143,7 @@ def refinement_at(
     (residuals,), considered, anchored = model.at(x)
     held, daily = considered[~model.daily], considered[model.daily]
     found = _refinement(model, x, linear, residuals, held, anchored=anchored, settled=settled)
-    return replace(found, information=information, daily=daily)
+    return _without_jumps(replace(found, information=information, daily=daily), linear)
 
 
 def _refinement(
@@ -180,6 +180,14 @@ def _refinement(
     )
 
 
+def _without_jumps(found: Refinement, linear: LinearModel) -> Refinement:
+    """Leave out rows that a break-away moves within the density: a slope through its jump is no
+    information on how sure the optimum is.
+    """
+    used = found.used & (linear.scatter < ESTIMATION.max_informative_scatter)
+    return replace(found, used=used, jacobian=np.where(used, found.jacobian, 0.0))
+
+
 def median_offsets(model: ResidualModel, residuals: Array) -> dict[str, float]:
     """Median residual of each signal as the constant error of its sensor, SI by name.
 
@@ -212,13 +220,19 @@ def last_round(
     model: of all of the tests, re-anchored on the spool; settled: whether the rounds before
     converged; others: further points, run in the same blocks. Returns the refinement, whose
     residuals are those of `model` moved by the lines, and the costs of the density's mean and of
-    the other points.
+    the other points. It has converged only where its own step, but for what oil and supply add, is
+    at most a deviation.
     """
     cross = CoordinateCross.about(model, density)
     count = len(cross.points)
     runs, considered, anchored = model.at(*cross.points, *others)
     linear = cross.lines(model, runs[:count])
     found = refined_by_step(model, linear, considered, anchored, settled=settled)
+    found = _without_jumps(found, linear)
+    step = _last_round_step(model, linear, linear.residuals, considered[:0])[0] - linear.at
+    most = near_spread(found) / FEW_UNKNOWNS_SCHEDULE.width
+    rests = bool(np.all(np.abs(step * found.scale)[model.curved] <= most))
+    found = replace(found, step=step, converged=settled and rests)
     return found, [capped_cost(linear.middle), *map(capped_cost, runs[count:])]
 
 
@@ -293,7 +307,7 @@ def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> 
         start, spread = found.values, near_spread(found)
         most = NEAR.max_step / FEW_UNKNOWNS_SCHEDULE.width * spread
         if turn > 0 and np.all(step <= most):
-            return found
+            return _without_jumps(found, linear)
     return None
 
 

@@ -12,6 +12,7 @@ import pytest
 from identify_cases import named, own_experiment, recorded
 from msgspec.structs import replace
 
+from ehadiag.core.criteria import ESTIMATION
 from ehadiag.identify.estimates import estimate_covariance
 from ehadiag.identify.experiment import lay_out_spans, unknowns_of
 from ehadiag.identify.least_squares import (
@@ -162,6 +163,25 @@ def test_the_last_round_estimates_the_oil_of_the_day():
     assert not np.any(after.jacobian[:, ~after.used])
     alone = estimate_covariance(replace(after, daily=after.daily[:0]))
     assert estimate_covariance(after)[2, 2] > 1.02 * alone[2, 2]
+
+
+def test_a_last_round_that_steps_by_more_than_a_deviation_has_not_come_to_rest():
+    _, std = by_the_rounds()
+    after, _ = last_round(whole(), belief(3.0), True)
+    assert not after.converged
+    assert (np.sqrt(np.diag(estimate_covariance(after))) > 2.0 * std * after.scale)[:3].all()
+
+
+def test_rows_that_jump_do_not_make_an_optimum_sure():
+    before, _ = by_the_rounds()
+    wide = replace(belief(), root=5.0 * belief().root)
+    linear = linearised_on_cross(whole(), wide)
+    found = refinement_at(whole(), before.x, linear, settled=True)
+    jumps = found.weighted & (linear.scatter >= ESTIMATION.max_informative_scatter)
+    counted = jumps & (linear.scatter < ESTIMATION.max_row_scatter)
+    assert np.count_nonzero(counted) > 5
+    assert not found.used[jumps].any()
+    assert not found.jacobian[:, jumps].any()
 
 
 @pytest.mark.parametrize("shift", [-2.0, 0.5])
