@@ -36,6 +36,7 @@ from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_sp
 from ehadiag.identify.identification_result import Identification, IdentificationTiming
 from ehadiag.identify.least_squares import Refinement
 from ehadiag.identify.nuisance_estimate import NuisanceEstimate, NuisanceEstimator
+from ehadiag.identify.nuisance_search import is_calibrated_oil
 from ehadiag.identify.partial_refinement import (
     FirstPart,
     SeverityAttempt,
@@ -295,7 +296,8 @@ class IdentificationSession:
                 () if self.nuisances is NuisanceMode.NONE else basic,
                 partial(progress, "nuisances"),
             )
-            freed = freeing.estimated(experiments, hint if near else None, alone_left)
+            near_enough = near or is_calibrated_oil(experiments, self.prior.joint)
+            freed = freeing.estimated(experiments, hint if near_enough else None, alone_left)
         if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
             return self._concluded_by_severities(
                 first,

@@ -47,11 +47,13 @@ from ehadiag.identify.nuisance_search import (
     NuisanceSearchSettings,
     StagedSearchResult,
     free_run_model,
+    is_calibrated_oil,
     noise_scaled_model,
     search_in_stages,
 )
 from ehadiag.identify.partial_refinement import considered_parameters
 from ehadiag.identify.posterior import (
+    BRIEF_SCHEDULE,
     FEW_UNKNOWNS_SCHEDULE,
     FINAL_SCHEDULE,
     PosteriorResult,
@@ -183,17 +185,18 @@ def estimate_about(
     )
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
+        found_oil = found.explained and is_calibrated_oil(experiments, settings.joint)
         progress = settings.progress
         search = partial(
             search_posterior,
             prior=prior,
             information=information,
             linearise=partial(linearised_by_regression, rng=rng),
-            schedule=FINAL_SCHEDULE,
+            schedule=BRIEF_SCHEDULE if found_oil else FINAL_SCHEDULE,
             between=no_interruption if progress is None else partial(progress, 1.0),
         )
         if not alone:
-            if settings.require_agreement and not found.confirmed:
+            if settings.require_agreement and not (found.confirmed or found_oil):
                 # A break-away may stand between the end of the search and the optimum.
                 density = _search_about(
                     fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain

@@ -101,6 +101,8 @@ hard (closed loop, little hysteresis) 38 came to the optimum, with 700 runs each
 0.75 19, with 480 runs; of 0.65 9, with 360; of 0.9 42, with 970."""
 FINAL_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, most_rounds=12, flat=4.0)
 """Schedule of a last search, which begins near the optimum."""
+BRIEF_SCHEDULE = replace(FINAL_SCHEDULE, most_rounds=6)
+"""The same where a calibrated unit with oil is explained: its best place is found by then."""
 FEW_UNKNOWNS_SCHEDULE = SearchSchedule(
     0.2, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0
 )

@@ -92,11 +92,19 @@ def prior_density(
 
 
 def density_about(
-    model: Derivatives, density: ParameterDensity, values: Mapping[str, float]
+    model: Derivatives,
+    density: ParameterDensity,
+    values: Mapping[str, float],
+    *,
+    known: bool = False,
 ) -> ParameterDensity:
-    """Density about values by name, 0 where not named: narrower than `density`."""
+    """Density about values by name, 0 where not named: narrower than `density`.
+
+    known: whether `density` is as narrow as what is known of all but the severities, and stays so.
+    """
+    shares = np.where(model.faults | (not known), WIDTHS.hint, 1.0)[model.curved]
     x = np.array([values.get(item.name, 0.0) for item in model.estimated]) / model.scale
-    return ParameterDensity(np.clip(x, model.lower, model.upper), WIDTHS.hint * density.root)
+    return ParameterDensity(np.clip(x, model.lower, model.upper), shares[:, None] * density.root)
 
 
 def small_effects_density(model: Derivatives, density: ParameterDensity) -> ParameterDensity:

@@ -103,46 +103,54 @@ def oil_at(j: JackLaw, place: Any) -> Any:
 
 
 @packed
-def orifice_rate(j: JackLaw, x: Any, p12: Any, velocity: Any, oil: Any) -> Any:
+def orifice_rate(j: JackLaw, x: Any, p12: Any, velocity: Any, oil: Any, both: bool = True) -> Any:
     """Rate of the pressure with the spool at `x` and the jack at a velocity, Pa/s (PHY-39).
 
-    oil: see `oil_at`.
+    oil: see `oil_at`; both: whether both orifices of a chamber may be open, as they are within
+    their underlap.
     """
     underlap, share = 2.0 * j.corner, p12 * j.by_supply
-    ahead, behind = maximum(x + underlap, x * 0.0), maximum(underlap - x, x * 0.0)
-    flow = ahead * _signed_root(1.0 - share) - behind * _signed_root(1.0 + share)
+    if both:
+        ahead, behind = maximum(x + underlap, x * 0.0), maximum(underlap - x, x * 0.0)
+        flow = ahead * _signed_root(1.0 - share) - behind * _signed_root(1.0 + share)
+    else:
+        side = copy_sign(x * 0.0 + 1.0, x)
+        flow = (x + side * underlap) * _signed_root(1.0 - side * share)
     return oil * (j.flow * flow - velocity - j.leak * p12)
 
 
 @packed
-def _friction(j: JackLaw, d: Any, velocity: Any) -> Any:
+def _friction(j: JackLaw, d: Any, velocity: Any, creeps: bool) -> Any:
     """Dry friction of a jack that moves in direction d, N."""
+    if not creeps:
+        return d * j.friction
     return d * (j.friction + stribeck_friction(j, maximum(velocity * d, velocity * 0.0)))
 
 
 @packed
 def orifice_step(
     j: JackLaw, h: Any, load: Any, oil: Any, d: Any, x0: Any, x1: Any, x2: Any, p12: Any,
-    velocity: Any,
+    velocity: Any, both: bool = True, creeps: bool = True,
 ) -> Any:  # fmt: skip
     """Pressure (Pa), velocity (m/s) and travel (m) after a step of `h` seconds.
 
     load: external force, N; oil: see `oil_at`, in the middle of the step; d: direction of the
     motion, 0 where the jack rests; x0, x1, x2: spool at the start, in the middle and at the end, m;
-    p12, velocity: at the start. Numbers or vectors.
+    p12, velocity: at the start; both: see `orifice_rate`; creeps: whether friction may have
+    Stribeck's part. Numbers or vectors.
     """
     half, ease = 0.5 * h, d * d * j.by_mass
-    dp1 = orifice_rate(j, x0, p12, velocity, oil)
-    dv1 = ease * (j.area * p12 - j.viscosity * velocity - load - _friction(j, d, velocity))
+    dp1 = orifice_rate(j, x0, p12, velocity, oil, both)
+    dv1 = ease * (j.area * p12 - j.viscosity * velocity - load - _friction(j, d, velocity, creeps))
     p, v = p12 + half * dp1, velocity + half * dv1
-    dp2 = orifice_rate(j, x1, p, v, oil)
-    dv2 = ease * (j.area * p - j.viscosity * v - load - _friction(j, d, v))
+    dp2 = orifice_rate(j, x1, p, v, oil, both)
+    dv2 = ease * (j.area * p - j.viscosity * v - load - _friction(j, d, v, creeps))
     p, v2 = p12 + half * dp2, velocity + half * dv2
-    dp3 = orifice_rate(j, x1, p, v2, oil)
-    dv3 = ease * (j.area * p - j.viscosity * v2 - load - _friction(j, d, v2))
+    dp3 = orifice_rate(j, x1, p, v2, oil, both)
+    dv3 = ease * (j.area * p - j.viscosity * v2 - load - _friction(j, d, v2, creeps))
     p, v3 = p12 + h * dp3, velocity + h * dv3
-    dp4 = orifice_rate(j, x2, p, v3, oil)
-    dv4 = ease * (j.area * p - j.viscosity * v3 - load - _friction(j, d, v3))
+    dp4 = orifice_rate(j, x2, p, v3, oil, both)
+    dv4 = ease * (j.area * p - j.viscosity * v3 - load - _friction(j, d, v3, creeps))
     sixth = h / 6.0
     return (
         p12 + sixth * (dp1 + 2.0 * (dp2 + dp3) + dp4),
@@ -152,10 +160,10 @@ def orifice_step(
 
 
 @packed
-def _stepped_jack(
-    j: JackLaw, p: PathPiece, d: float, place: float, p12: float, velocity: float,
-    begin: float, end: float,
-) -> tuple[float, float, float]:  # fmt: skip
+def stepped_jack(
+    j: JackLaw, p: PathPiece, d: Any, place: Any, p12: Any, velocity: Any, begin: Any, end: Any,
+    creeps: bool = True,
+) -> Any:  # fmt: skip
     """Place, pressure and velocity at the share `end` of a piece, from those at `begin`."""
     h = (end - begin) * p.span
     middle = place + 0.5 * h * velocity
@@ -165,12 +173,14 @@ def _stepped_jack(
         position_on_piece(p, 0.5 * (begin + end)),
         position_on_piece(p, end),
     )
-    p12, velocity, travel = orifice_step(j, h, load, oil, d, x0, x1, x2, p12, velocity)
+    p12, velocity, travel = orifice_step(
+        j, h, load, oil, d, x0, x1, x2, p12, velocity, True, creeps
+    )
     return place + travel, p12, velocity
 
 
 @packed
-def _driving_force(j: JackLaw, place: float, p12: float) -> float:
+def driving_force(j: JackLaw, place: Any, p12: Any) -> Any:
     """Force on the resting jack but for its friction, N."""
     return j.area * p12 - j.load - j.spring * place
 
@@ -184,7 +194,7 @@ def _event_distance(
         return velocity * d
     if event == JACK_EVENTS.bound:
         return j.stroke - place * d
-    return j.static - _driving_force(j, place, p12) * d
+    return j.static - driving_force(j, place, p12) * d
 
 
 @packed
@@ -198,12 +208,12 @@ def _event_share(
     """
     low, high = begin, end
     at_low = _event_distance(j, event, d, place, p12, velocity)
-    then = _stepped_jack(j, p, direction, place, p12, velocity, begin, end)
+    then = stepped_jack(j, p, direction, place, p12, velocity, begin, end)
     at_high = _event_distance(j, event, d, then[0], then[1], then[2])
     side = 0
     for _ in range(ORIFICE_STEPS.iterations):
         q = high - (high - low) * at_high / (at_high - at_low)
-        then = _stepped_jack(j, p, direction, place, p12, velocity, begin, q)
+        then = stepped_jack(j, p, direction, place, p12, velocity, begin, q)
         value = _event_distance(j, event, d, then[0], then[1], then[2])
         if value > 0.0:
             low, at_low = q, value
@@ -245,15 +255,15 @@ def _pieces(senses: bool) -> Any:
         q, step, events = begin, 1, 0
         while step <= steps:
             end = begin + (stop - begin) * step / steps
-            push = _driving_force(j, place, p12)
+            push = driving_force(j, place, p12)
             bound = abs(place) >= j.stroke and place * push > 0.0
             if d == 0.0 and abs(push) > j.static and not bound and events < ORIFICE_STEPS.events:
                 d = 1.0 if push > 0.0 else -1.0
             until = end
-            later = _stepped_jack(j, p, d, place, p12, velocity, q, end)
+            later = stepped_jack(j, p, d, place, p12, velocity, q, end)
             event = -1
             if d == 0.0:
-                now = _driving_force(j, later[0], later[1])
+                now = driving_force(j, later[0], later[1])
                 held = abs(now) <= j.static or (abs(place) >= j.stroke and place * now > 0.0)
                 if not held and events < ORIFICE_STEPS.events:
                     event, way = JACK_EVENTS.start, 1.0 if now > 0.0 else -1.0
@@ -268,7 +278,7 @@ def _pieces(senses: bool) -> Any:
                     events, d = ORIFICE_STEPS.events, 0.0
                 else:
                     until = _event_share(j, event, way, p, d, place, p12, velocity, q, end)
-                later = _stepped_jack(j, p, d, place, p12, velocity, q, until)
+                later = stepped_jack(j, p, d, place, p12, velocity, q, until)
             if senses and until > q:
                 h, oil = (until - q) * p.span, oil_at(j, place)
                 cubic = cubic_through_ends(

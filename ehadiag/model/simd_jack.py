@@ -55,7 +55,7 @@ from ehadiag.model.sensors import (
     read_pressure,
     sensor_law,
 )
-from ehadiag.model.simd_jack_pieces import jack_events, jack_over_pieces
+from ehadiag.model.simd_jack_pieces import jack_events, jack_over_pieces, orifice_events
 from ehadiag.model.simd_layout import (
     BLOCK,
     COEFFICIENTS,
@@ -364,11 +364,30 @@ def _orifice_lane_step(senses: bool) -> Any:
 
     @packed
     def lanes(
-        end: int, level: int, step: int, tick: float, state: Array, path: Array, coefficients: Array
-    ) -> bool:
+        end: int, level: int, step: int, tick: float,
+        state: Array, path: Array, coefficients: Array, later: Array,
+    ) -> bool:  # fmt: skip
         any_busy = False
         h = tick / (1 << level)
         k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
+        # Apart from what becomes of it: a processor works on all vectors at once.
+        for o in range(0, end, VECTOR_WIDTH):
+            j = jack_laws(coefficients, o)
+            velocity = load(state, ROWS.jack_velocity * LANES + o)
+            x0 = stage_position(path, o, k + STAGES.start, tick)
+            x1 = stage_position(path, o, k + STAGES.middle, tick)
+            x2 = stage_position(path, o, k + STAGES.end, tick)
+            closest = minimum(minimum(absolute(x0), absolute(x1)), absolute(x2))
+            middle = load(state, ROWS.jack * LANES + o) + 0.5 * h * velocity
+            p, v, travel = orifice_step(
+                j, h, j.load + j.spring * middle, oil_at(j, middle),
+                load(state, ROWS.jack_direction * LANES + o), x0, x1, x2,
+                load(state, ROWS.pressure * LANES + o), velocity,
+                any_lane(closest < 2.0 * j.corner), any_lane(j.extra > 0.0),
+            )  # fmt: skip
+            store(later, o, p)
+            store(later, LANES + o, v)
+            store(later, 2 * LANES + o, travel)
         for o in range(0, end, VECTOR_WIDTH):
             j = jack_laws(coefficients, o)
             place, velocity = (
@@ -379,29 +398,27 @@ def _orifice_lane_step(senses: bool) -> Any:
                 load(state, ROWS.jack_direction * LANES + o),
                 load(state, ROWS.pressure * LANES + o),
             )
-            x0, x2 = (
-                stage_position(path, o, k + STAGES.start, tick),
-                stage_position(path, o, k + STAGES.end, tick),
-            )
-            x1 = stage_position(path, o, k + STAGES.middle, tick)
-            middle = place + 0.5 * h * velocity
-            force, oil = j.load + j.spring * middle, oil_at(j, middle)
-            p, v, travel = orifice_step(j, h, force, oil, d, x0, x1, x2, p12, velocity)
+            p, v, travel = load(later, o), load(later, LANES + o), load(later, 2 * LANES + o)
+            oil = oil_at(j, place + 0.5 * h * velocity)
             push = j.area * p - j.load - j.spring * place
             held = absolute(push) <= j.static
             held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
             slides = (v * d > 0.0) & (absolute(place + travel) < j.stroke)
             done = load(state, ROWS.done * LANES + o) != 0.0
             goes = (((d == 0.0) & held) | slides) & ~done
-            goes = goes & (
-                oil * j.area * j.by_mass * (h * h) < LANE_STEPS.ringing * LANE_STEPS.ringing
-            )
+            fits = oil * j.area * j.by_mass * (h * h) < LANE_STEPS.ringing * LANE_STEPS.ringing
             steep = j.extra * j.by_stribeck * j.by_mass * h > ORIFICE_STEPS.creep_growth
             slow = (
                 minimum(absolute(velocity), absolute(v)) * j.by_stribeck < ORIFICE_STEPS.creep_limit
             )
-            goes = goes & ~(steep & slow & (d != 0.0))
+            fits = fits & ~(steep & slow)
+            goes = goes & fits
+            events = ~(goes | done)
             if senses:
+                law = sensor_laws(coefficients, o)
+                events = events & (law.lag + law.lead == 0.0)
+                x0 = stage_position(path, o, k + STAGES.start, tick)
+                x2 = stage_position(path, o, k + STAGES.end, tick)
                 cubic = cubic_through_ends(
                     p12, p,
                     h * orifice_rate(j, x0, p12, velocity, oil), h * orifice_rate(j, x2, p, v, oil),
@@ -410,6 +427,17 @@ def _orifice_lane_step(senses: bool) -> Any:
             store(state, ROWS.pressure * LANES + o, where(goes, p, p12))
             store(state, ROWS.jack_velocity * LANES + o, where(goes, v, velocity))
             store(state, ROWS.jack * LANES + o, where(goes, place + travel, place))
+            if any_lane(events):
+                node, span = (step * LANE_NODES) >> level, tick / LANE_NODES
+                a, begin = node * LANES + o, step * LANE_NODES / (1 << level) - node
+                slope = LANE_PATH_SLOPE * LANES + a
+                orifice_events(
+                    o, where(events, 1.0, 0.0), p12 * 0.0 + span,
+                    load(path, a), load(path, a + LANES),
+                    span * load(path, slope), span * load(path, slope + LANES),
+                    begin, begin + LANE_NODES / (1 << level), state, coefficients,
+                )  # fmt: skip
+                goes = goes | events
             store(state, ROWS.busy * LANES + o, where(goes | done, 0.0, 1.0))
             if any_lane(~(goes | done)):
                 any_busy = True
@@ -431,9 +459,10 @@ def _ticks(senses: bool) -> Any:
         state: Array,
         path: Array,
         coefficients: Array,
+        later: Array,
     ) -> None:
         for step in range(1 << level):
-            if lanes(end, level, step, tick, state, path, coefficients):
+            if lanes(end, level, step, tick, state, path, coefficients, later):
                 jack_events(count, level, step, tick, state, path, coefficients)
 
     return ticks

@@ -12,6 +12,8 @@ from ehadiag.compile.vector import (
     Vector,
     absolute,
     any_lane,
+    copy_sign,
+    lane_sqrt,
     large_packed,
     load,
     maximum,
@@ -23,7 +25,15 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.jack import JACK_STEPS
 from ehadiag.model.laws import JackLaw, excess_force, stage_resistance
-from ehadiag.model.second_stage import jack_piece, land_opening_piece
+from ehadiag.model.second_stage import (
+    ORIFICE_STEPS,
+    driving_force,
+    jack_piece,
+    land_opening_piece,
+    oil_at,
+    orifice_rate,
+    stepped_jack,
+)
 from ehadiag.model.sensors import (
     RADAU,
     JackState,
@@ -103,6 +113,115 @@ def jack_events(
         keep_lane_jack(jack, state, i)
 
 
+CROSSING_ROUNDS = 10
+"""Rounds for the root of a cubic, 1: from each side to 1e-9 of a step."""
+
+
+@packed
+def _crossing(g0: Vector, g1: Vector, s0: Vector, s1: Vector) -> Vector:
+    """Share of a step at which a cubic with ends g0 > 0 >= g1 and slopes s0, s1 is 0 (Illinois)."""
+    low, high, at_low, at_high, side = g0 * 0.0, g0 * 0.0 + 1.0, g0, g1, g0 * 0.0
+    for _ in range(CROSSING_ROUNDS):
+        drop = minimum(at_high - at_low, -JACK_STEPS.least_rate)
+        q = high - (high - low) * at_high / drop
+        r = 1.0 - q
+        value = g0 + q * q * (3.0 - 2.0 * q) * (g1 - g0) + q * r * (r * s0 - q * s1)
+        before = value > 0.0
+        at_high = where(before, where(side > 0.0, 0.5 * at_high, at_high), value)
+        at_low = where(before, value, where(side < 0.0, 0.5 * at_low, at_low))
+        low, high = where(before, q, low), where(before, high, q)
+        side = where(before, 1.0, -1.0)
+    return high
+
+
+@large_packed
+def orifice_events(
+    o: int,
+    these: Vector,
+    span: Vector,
+    x0: Vector,
+    x1: Vector,
+    rise0: Vector,
+    rise1: Vector,
+    begin: float,
+    stop: float,
+    state: Array,
+    coefficients: Array,
+) -> None:
+    """Jack behind orifices over the shares begin … stop of a piece, with stops and starts.
+
+    Of the lanes from `o` in which `these` is not 0; the other numbers are those of a `PathPiece`.
+    """
+    j, mine = jack_laws(coefficients, o), these != 0.0
+    place, velocity = (
+        load(state, ROWS.jack * LANES + o),
+        load(state, ROWS.jack_velocity * LANES + o),
+    )
+    d, p12 = load(state, ROWS.jack_direction * LANES + o), load(state, ROWS.pressure * LANES + o)
+    zero = d * 0.0
+    one, creeps = zero + 1.0, any_lane(j.extra > 0.0)
+    span = where(mine, span, 1.0)
+    piece = PathPiece(span, x0, x1, rise0, rise1)
+    ring = lane_sqrt(maximum(oil_at(j, place), ORIFICE_STEPS.least_share) * j.area * j.by_mass)
+    usual = minimum(ORIFICE_STEPS.ringing / ring, ORIFICE_STEPS.longest_s) * (1.0 + 1e-9)
+    growth = maximum(j.extra * j.by_stribeck * j.by_mass, 1.0)
+    q, end, until, count, goes = zero + begin, zero + stop, zero + begin, zero, mine
+    while any_lane(goes):
+        longest = usual
+        if creeps:
+            # Friction that falls with the velocity drives the jack away.
+            slow = absolute(velocity) * j.by_stribeck < ORIFICE_STEPS.creep_limit
+            longest = where(slow, minimum(usual, ORIFICE_STEPS.creep_growth / growth), usual)
+        left = (end - q) * span
+        until = where(left > longest, q + minimum(longest, 0.5 * left) / span, end)
+        push, free = driving_force(j, place, p12), count < ORIFICE_STEPS.events * 1.0
+        away = (absolute(push) > j.static) & free
+        away = away & ~((absolute(place) >= j.stroke) & (place * push > 0.0))
+        d = where((d == 0.0) & away, copy_sign(one, push), d)
+        there, p, v = stepped_jack(j, piece, d, place, p12, velocity, q, until, creeps)
+        later = driving_force(j, there, p)
+        starts = (d == 0.0) & (absolute(later) > j.static) & free
+        starts = starts & ~((absolute(place) >= j.stroke) & (place * later > 0.0))
+        stops = (d != 0.0) & (v * d <= 0.0)
+        meets = (d != 0.0) & (there * d >= j.stroke) & ~stops
+        # It does not get away: at rest for this step.
+        stays = stops & (velocity == 0.0)
+        events = (starts | (stops & ~stays) | meets) & goes
+        if any_lane(events):
+            way = where(d == 0.0, copy_sign(one, later), d)
+            h, oil = (until - q) * span, oil_at(j, place)
+            rate0 = h * orifice_rate(j, position_on_piece(piece, q), p12, velocity, oil)
+            rate1 = h * orifice_rate(j, position_on_piece(piece, until), p, v, oil)
+            drag, by_time = d * j.friction, h * j.by_mass * d
+            slope0 = where(starts, -j.area * rate0 * way, -h * velocity * d)
+            slope1 = where(starts, -j.area * rate1 * way, -h * v * d)
+            slope0 = where(stops, by_time * (push - j.viscosity * velocity - drag), slope0)
+            slope1 = where(stops, by_time * (later - j.viscosity * v - drag), slope1)
+            off0 = where(starts, j.static - push * way, j.stroke - place * d)
+            off1 = where(starts, j.static - later * way, j.stroke - there * d)
+            off0, off1 = where(stops, velocity * d, off0), where(stops, v * d, off1)
+            share = _crossing(
+                where(events, off0, 1.0), where(events, off1, -1.0),
+                where(events, slope0, -2.0), where(events, slope1, -2.0),
+            )  # fmt: skip
+            until = where(events, q + share * (until - q), until)
+            there, p, v = stepped_jack(j, piece, d, place, p12, velocity, q, until, creeps)
+            there = where(meets & events, copy_sign(j.stroke, way), there)
+            v = where(events & ~starts, 0.0, v)
+            d = where(events, where(starts, way, 0.0), d)
+        moves = goes & ~stays
+        place, p12 = where(moves, there, place), where(moves, p, p12)
+        velocity, q = where(moves, v, velocity), where(moves, until, q)
+        d = where(goes & stays, 0.0, d)
+        count = where(events, count + 1.0, where(stays, ORIFICE_STEPS.events * 1.0, 0.0))
+        goes = goes & (end - q >= ORIFICE_STEPS.least_share)
+    store_where(state, ROWS.jack * LANES + o, mine, place)
+    store_where(state, ROWS.jack_velocity * LANES + o, mine, velocity)
+    store_where(state, ROWS.jack_direction * LANES + o, mine, d)
+    store_where(state, ROWS.fresh * LANES + o, mine, zero)
+    store_where(state, ROWS.pressure * LANES + o, mine, p12)
+
+
 PIECE_NUMBERS = 4 * VECTOR_WIDTH
 """Numbers of a piece, VECTOR_WIDTH lanes each: duration (s; 0 in a lane that has no such piece),
 place at the end, velocities at start and end."""
@@ -133,15 +252,22 @@ def jack_over_pieces(
         load(state, ROWS.jack_velocity * LANES + o),
     )
     d, fresh = load(state, ROWS.jack_direction * LANES + o), load(state, ROWS.fresh * LANES + o)
-    plain = (j.oil == 0.0) & (j.extra == 0.0) & (j.shaped == 0.0) & (law.lag + law.lead == 0.0)
-    plain = plain & (these != 0.0)
-    if any_lane((these != 0.0) & ~plain):
-        store(pieces, SINGLE_LANE_FLAGS, where(plain, 0.0, these))
+    plain = (j.shaped == 0.0) & (law.lag + law.lead == 0.0) & (these != 0.0)
+    orifice = plain & (j.oil > 0.0)
+    plain = plain & (j.oil == 0.0) & (j.extra == 0.0)
+    if any_lane((these != 0.0) & ~plain & ~orifice):
+        store(pieces, SINGLE_LANE_FLAGS, where(plain | orifice, 0.0, these))
         _single_lanes(o, 0, count, tick, state, path, coefficients, pieces)
     x0 = load(path, LANE_PATH * LANES + o)
     for n in range(count):
         k = n * PIECE_NUMBERS
         span, x1 = load(pieces, k), load(pieces, k + VECTOR_WIDTH)
+        if any_lane(orifice & (span > 0.0)):
+            orifice_events(
+                o, where(orifice & (span > 0.0), 1.0, 0.0), span, x0, x1,
+                load(pieces, k + 2 * VECTOR_WIDTH) * span,
+                load(pieces, k + 3 * VECTOR_WIDTH) * span, 0.0, 1.0, state, coefficients,
+            )  # fmt: skip
         here = plain & (span > 0.0)
         if any_lane(here):
             hold = j.spring * place
@@ -185,7 +311,7 @@ def jack_over_pieces(
                     load(state, ROWS.jack_direction * LANES + o),
                     load(state, ROWS.fresh * LANES + o),
                 )
-            x0 = where(span > 0.0, x1, x0)
+        x0 = where(span > 0.0, x1, x0)
     _keep(o, plain, place, velocity, d, fresh, state)
     store(
         state, ROWS.done * LANES + o, where(these != 0.0, 1.0, load(state, ROWS.done * LANES + o))

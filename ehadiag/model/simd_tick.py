@@ -107,15 +107,16 @@ def _other_jack_tick(
     state: Array,
     path: Array,
     coefficients: Array,
+    scratch: Array,
 ) -> None:
     """The same of an orifice stage, or with the pressure as the filter before its converter has it.
 
     Apart from the plain one, so that this stays as it is.
     """
     if orifice and senses:
-        sensed_orifice_tick(count, end, tick, level, state, path, coefficients)
+        sensed_orifice_tick(count, end, tick, level, state, path, coefficients, scratch)
     elif orifice:
-        orifice_tick(count, end, tick, level, state, path, coefficients)
+        orifice_tick(count, end, tick, level, state, path, coefficients, scratch)
     else:
         for step in range(1 << level):
             if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
@@ -176,8 +177,9 @@ def advance_block(
     if with_jack:
         if has.senses or has.orifice:
             _other_jack_tick(
-                count, end, has.orifice, has.senses, tick, level, state, path, coefficients
-            )
+                count, end, has.orifice, has.senses, tick, level, state, path, coefficients,
+                block_part(address, BLOCK.scratch, BLOCK.end),
+            )  # fmt: skip
         else:
             _jack_tick(count, end, tick, level, state, path, coefficients)
         sampled_pressures(end, has.senses or has.orifice, state, path, coefficients)
