@@ -304,18 +304,30 @@ def _paper_report(records: Sequence[Record], options: Options) -> Iterator[str]:
 def _cube_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
-    add("--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%")
+    add_conditions(parser)
     add("--wear", action="append", type=float, metavar="K",
         help="also begin from a diagnosis with severities that differ by so much; may be repeated"
     )  # fmt: skip
 
 
+def random_days(options: Options) -> list[tuple[float, float] | None]:
+    """Oil, degC, and supply, Pa, for each random case; None without `--conditions`."""
+    if not options.conditions:
+        return [None] * options.cases
+    rng, supply = np.random.default_rng([options.seed, 1]), Effects().supply_pressure
+    low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
+    return [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
+
+
+def add_conditions(parser: argparse.ArgumentParser) -> None:
+    """Add the option for days of random oil and supply, see `random_days`."""
+    parser.add_argument(
+        "--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%"
+    )
+
+
 def _cube_cases(options: Options) -> list[Case]:
-    days: list[tuple[float, float] | None] = [None] * options.cases
-    if options.conditions:
-        rng, supply = np.random.default_rng([options.seed, 1]), Effects().supply_pressure
-        low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
-        days = [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
+    days = random_days(options)
     return [
         Case(test, faults, noise_seed=index, conditions=day, wear=wear)
         for test in options.test or ("open", "closed")

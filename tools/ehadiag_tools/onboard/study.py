@@ -38,7 +38,14 @@ from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD as PLACES
 from ehadiag.onboard.onboard_memory import OnboardOutcome
 from ehadiag_sim.conditions import Effects
-from ehadiag_tools.accuracy.cases import UnitCase, draw_unit, knowledge, record_worn
+from ehadiag_tools.accuracy.cases import (
+    UnitCase,
+    add_conditions,
+    draw_unit,
+    knowledge,
+    random_days,
+    record_worn,
+)
 from ehadiag_tools.accuracy.figures import accuracy_table, is_answered
 from ehadiag_tools.onboard.replay import (
     EMULATED,
@@ -251,7 +258,8 @@ class OnboardUnit:
     """Unit `case` of a seed, recorded in a stored test.
 
     Data: one of `DATA`. Groups: of effects of a calibrated one, see `random_unit`. Bits: whether
-    the builds of the kernels for this computer are compared.
+    the builds of the kernels for this computer are compared, too. Conditions: oil, degC, and
+    supply, Pa, of the day; None: the simulator's own.
     """
 
     test: str
@@ -260,6 +268,7 @@ class OnboardUnit:
     data: str = "textbook"
     groups: tuple[str, ...] = ()
     bits: bool = False
+    conditions: tuple[float, float] | None = None
 
 
 class OnboardLibrary:
@@ -306,7 +315,12 @@ def perform_random(case: OnboardUnit) -> Record:
     kind = "calibrated" if of_unit else "textbook"
     drawn = UnitCase(case.test, case.case, case.seed, data=kind, groups=case.groups)
     unit, severities = draw_unit(drawn)
-    recording = record_worn(drawn, UNKNOWN.get(case.data, unit), case.test, severities)
+    unit = UNKNOWN.get(case.data, unit)
+    if case.conditions is not None:
+        oil, supply = case.conditions
+        day = replaced(unit.effects, oil_temperature=oil, supply_pressure=supply)
+        unit = replaced(unit, effects=day)
+    recording = record_worn(drawn, unit, case.test, severities)
     known = replaced(drawn, test=TESTS[0]) if of_unit else None
     library = _library(known)
     begin = time.process_time()
@@ -328,16 +342,17 @@ def perform_random(case: OnboardUnit) -> Record:
         )
         out["same_bits"] = portable.tobytes() == numbers.tobytes()
         apart = np.abs(fused[:3] - numbers[:3]) / numbers[3:6]
-        out["fused"], out["fused_verdict"] = float(apart.max()), fused[8] == numbers[8]
-    else:
-        mode = NuisanceMode.NONE if case.data == "textbook" else NuisanceMode.AUTO
-        host = diagnose([recording], library.actuator, bundled_tests().values(), nuisances=mode)
-        assert host.identification is not None
-        estimates = host.identification.estimates
-        out |= {
-            "host_verdict": host.verdict.name, "host": [item.value for item in estimates],
-            "host_std": [item.std for item in estimates],
-        }  # fmt: skip
+        out["fused"] = float(apart.max())
+        out["fused_verdict"] = bool(fused[8] == numbers[8])
+    mode = NuisanceMode.NONE if case.data == "textbook" else NuisanceMode.AUTO
+    begin = time.process_time()
+    host = diagnose([recording], library.actuator, bundled_tests().values(), nuisances=mode)
+    assert host.identification is not None
+    estimates = host.identification.estimates
+    out |= {
+        "host_verdict": host.verdict.name, "host": [item.value for item in estimates],
+        "host_std": [item.std for item in estimates], "host_s": time.process_time() - begin,
+    }  # fmt: skip
     return {name: _plain(value) for name, value in out.items()}
 
 
@@ -352,24 +367,29 @@ def _random_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=TESTS, help="may be repeated (both)")
     add("--data", action="append", choices=DATA, help="what the units are (textbook)")
-    add("--bits", action="store_true", help="compare builds for this computer, not the package")
+    add("--bits", action="store_true", help="compare builds for this computer, too")
+    add_conditions(parser)
     add_group(parser)
 
 
 def _random_cases(options: Options) -> list[OnboardUnit]:
+    groups = tuple(sorted(set(options.group)))
     return [
-        OnboardUnit(test, case, options.seed, data, tuple(sorted(set(options.group))), options.bits)
+        OnboardUnit(test, case, options.seed, data, groups, options.bits, day)
         for data in options.data or DATA[:1]
-        for case in range(options.cases)
+        for case, day in enumerate(random_days(options))
         for test in options.test or TESTS
     ]
 
 
 def _random_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     yield from accuracy_table(records, "data", "test")
-    runs, spent = np.mean([(item["runs"], item["processor_s"]) for item in records], axis=0)
-    yield f"\n{runs:.0f} model runs and {spent:.2f} s of processor a test"
-    yield from _bits_lines(records) if options.bits else _package_lines(records)
+    costs = [(item["runs"], 1e3 * item["processor_s"], 1e3 * item["host_s"]) for item in records]
+    runs, spent, beside = np.median(costs, axis=0)
+    yield f"\nMedians: {runs:.0f} model runs, {spent:.0f} ms of processor; package {beside:.0f} ms"
+    if options.bits:
+        yield from _bits_lines(records)
+    yield from _package_lines(records)
     yield f"\nNOT TESTED, or beyond {FAR_OFF:g} deviations:\n"
     yield from markdown(
         ("data", "test", "case", "truth", "estimate", "outliers", "reasons"),
@@ -401,11 +421,12 @@ def _package_lines(records: Sequence[Record]) -> Iterator[str]:
             cells += [", ".join(f"{value:.2f}" for value in np.median(ratio, axis=0))]
             cells += [", ".join(f"{value:.2f}" for value in ratio.max(axis=0))]
         other = sum(item["verdict"] != item["host_verdict"] for item in part)
-        rows.append((data, test, len(part), len(answered), *(cells or "––––"), other))
+        shown = sum(item["host_verdict"] != Verdict.NOT_TESTED.name for item in part)
+        rows.append((data, test, len(part), len(answered), shown, *(cells or "––––"), other))
     yield "\nThe package beside, in deviations of the library, for Kintas, FSS, FDJ:\n"
     yield from markdown(
-        ("data", "test", "cases", "answered", "apart, mean", "most", "deviation over its, median",
-         "most", "other verdicts"),
+        ("data", "test", "cases", "answered", "by the package", "apart, mean", "most",
+         "deviation over its, median", "most", "other verdicts"),
         rows,
     )  # fmt: skip
 
@@ -425,7 +446,7 @@ def _text(values: Sequence[float | None]) -> str:
 
 ONBOARD_UNITS = Study(
     "onboard-units",
-    "Random units through the exported library, the package or other builds beside.",
+    "Random units through the exported library, the package and other builds beside.",
     _random_cases, perform_random, _random_report, _random_options, count=40,
     counted="random units", failed=_is_far,
 )  # fmt: skip
