@@ -45,7 +45,7 @@ from ehadiag.export.targets import (
     static_library,
 )
 from ehadiag.identify.estimates import FIRST_STAGE_STD
-from ehadiag.identify.prior import calibration_covariance, unit_prior
+from ehadiag.identify.prior import DAILY_PRIORS, calibration_covariance, unit_prior
 from ehadiag.model.plant import PlantConstants, plant_constants
 from ehadiag.model.registry import Unknowns, unit_constants
 from ehadiag.model.severities import FAULT_LAWS
@@ -171,6 +171,13 @@ def _window_numbers(windows: Sequence[TimeWindow], rate: float) -> list[float]:
     return [*ticks, *[0.0] * (2 * PLAN_WINDOWS - len(ticks))]
 
 
+BUS_VISCOSITY_STD: Final = 2.5e-3
+"""Deviation of the oil's viscosity by the default bus's steps of 0.1 K at -20 degC, relative, 1; of
+hotter oil it is less, and does less."""
+BUS_SUPPLY_STD: Final = 4.1e3
+"""Deviation of the supply by the default bus's steps of 0.01 MPa of supply and return, Pa."""
+
+
 def verdict_rules(actuator: Actuator) -> VerdictRules:
     """Return the rules of a verdict on board: those of `ehadiag diagnose` at its default levels.
 
@@ -179,7 +186,8 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
     levels, (outliers, rms) = Levels(), residual_limits(actuator.calibration)
     prior, valve = unit_prior(actuator), actuator.servovalve
     low, high = prior.exponents
-    exact = actuator.calibration is None and low == high and not any(prior.discrepancy.values())
+    calibrated = actuator.calibration is not None
+    exact = not calibrated and low == high and not any(prior.discrepancy.values())
     _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
     return VerdictRules(
         advisory=levels.advisory,
@@ -199,6 +207,8 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         least_supply=RECORDING.min_supply_pressure_share * valve.PSR,
         **{f"discrepancy_{name}": prior.std.get(name, 0.0) for name in FAULT_LAWS},
         **{f"law_{name}": size for name, size in prior.discrepancy.items()},
+        viscosity_std=DAILY_PRIORS["oil_viscosity"].std if calibrated else BUS_VISCOSITY_STD,
+        supply_std=DAILY_PRIORS["supply_pressure"].std if calibrated else BUS_SUPPLY_STD,
         exponents=high - low,
         first_stage=FIRST_STAGE_STD,
         friction_new=valve.FSS0 / valve.FSS1 if low < high else 0.0,

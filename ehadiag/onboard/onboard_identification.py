@@ -269,17 +269,19 @@ def end_pass(address: int, plan: Array) -> float:
         last, settled = end_round(address, steps + 1.0)
         p[PROGRESS.settled] = 1.0 if settled else 0.0
         if last:
-            following = PHASES.day if direction_count(plan) > 0 else PHASES.conclusion
+            following = PHASES.day
     elif phase == PHASES.conclusion:
         following = end_conclusion(address, plan)
     elif phase == PHASES.considered:
         end_directions(address)
     else:
-        end_day(address)
+        end_day(address, plan)
         following = phase + 1.0
-    if (following == PHASES.last_day and direction_count(plan) == 0) or (
-        phase == following == PHASES.considered
-        and p[PROGRESS.steps] * DIRECTIONS_OF_PASS >= direction_count(plan)
+    passes = p[PROGRESS.steps] if phase == PHASES.considered else 0.0
+    if (
+        following == PHASES.considered
+        and phase >= PHASES.last_day
+        and passes * DIRECTIONS_OF_PASS >= direction_count(plan)
     ):
         write_result(address, plan)
         following = PHASES.done

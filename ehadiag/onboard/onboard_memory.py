@@ -308,6 +308,10 @@ class VerdictRules(NamedTuple):
     """Deviations of the severities by wrong laws of the faults, over the severity."""
     law_FSS: float
     law_FDJ: float
+    viscosity_std: float
+    """Deviations of what is said of oil and supply, relative and Pa: by the sensors of a calibrated
+    unit, else by the bus's steps."""
+    supply_std: float
     exponents: float
     """Length of the range of exponents of clogging; it is identified with the largest one."""
     first_stage: float

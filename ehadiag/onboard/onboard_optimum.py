@@ -528,7 +528,7 @@ def add_day(address: int, plan: Array, k: int) -> None:
 
 
 @bare_kernel
-def end_day(address: int) -> None:
+def end_day(address: int, plan: Array) -> None:
     """Step with viscosity and supply, see `ehadiag.identify.least_squares.refined_with_day`.
 
     The severities' columns of the covariance that is left are in the memory then.
@@ -552,8 +552,9 @@ def end_day(address: int) -> None:
         p[ONBOARD.considered + i] = 0.0
         for j in range(ONBOARD_UNKNOWNS):
             p[ONBOARD.influence + i * ONBOARD_UNKNOWNS + j] = column[j] if shown else 0.0
-    # The rounds hold the day: what its step, by lines, has taken off an estimate counts.
-    for day in range(ONBOARD_PARAMETERS, ONBOARD_UNKNOWNS):
+    # The rounds hold the day: what its step, by lines, has taken off an estimate counts where it
+    # may be long, as the sensors of a calibrated unit err by more than the bus's steps.
+    for day in range(ONBOARD_PARAMETERS, ONBOARD_UNKNOWNS if direction_count(plan) > 0 else 0):
         variance = inverse_column(normal, day, matrix, column)
         for i in range(ONBOARD_GENES if variance > 0.0 else 0):
             p[ONBOARD.considered + i] += (point[day] * column[i] / variance) ** 2
@@ -642,7 +643,7 @@ def write_result(address: int, plan: Array) -> None:
     write_deviations(
         address,
         plan,
-        ONBOARD_UNKNOWNS if direction_count(plan) > 0 else ONBOARD_PARAMETERS,
+        ONBOARD_UNKNOWNS,
         p[USED_SQUARES] / max(p[USED] - ONBOARD_PARAMETERS, 1),
     )
     p[FSS], p[ONBOARD_GENES + FSS] = (

@@ -17,7 +17,6 @@ from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.criteria import ESTIMATION, FIT, REFINEMENT
 from ehadiag.identify.compact_ga import CompactGaState, draw_generation, update_state
-from ehadiag.identify.prior import DAILY_PRIORS
 from ehadiag.identify.staged_search import SEARCH_STAGES
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.sensors import read_pressure
@@ -59,10 +58,6 @@ ANCHOR_LARGE_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_la
 HALVINGS_PLACE = MONITOR.settings + MonitorSettings._fields.index("halvings")
 KINTAS, FSS, FDJ = range(ONBOARD_GENES)
 """Places of the severities."""
-VISCOSITY_STD, SUPPLY_STD = (
-    DAILY_PRIORS[name].std for name in ("oil_viscosity", "supply_pressure")
-)
-"""Deviations of what the sensors say, relative and Pa."""
 
 
 class SeverityGrid(NamedTuple):
@@ -172,9 +167,9 @@ def start_model_by(
         unit[i] = min(max(point[i], 0.0), 1.0)
     unit[UNIT_SPOOL_OFFSET] = point[ONBOARD_GENES] / plan[PLAN_SPOOL_WEIGHT]
     unit[UNIT_PRESSURE_OFFSET] = point[ONBOARD_GENES + 1] / plan[PLAN_PRESSURE_WEIGHT]
-    viscosity, supply = unit[UNIT_VISCOSITY], unit[UNIT_SUPPLY]
-    unit[UNIT_VISCOSITY] = viscosity * (1.0 + VISCOSITY_STD * point[ONBOARD_PARAMETERS])
-    unit[UNIT_SUPPLY] = supply + SUPPLY_STD * point[ONBOARD_PARAMETERS + 1]
+    viscosity, supply, rules = unit[UNIT_VISCOSITY], unit[UNIT_SUPPLY], verdict_rules_of(plan)
+    unit[UNIT_VISCOSITY] = viscosity * (1.0 + rules.viscosity_std * point[ONBOARD_PARAMETERS])
+    unit[UNIT_SUPPLY] = supply + rules.supply_std * point[ONBOARD_PARAMETERS + 1]
     state = address + BYTES_PER_NUMBER * ONBOARD.unit
     model = monitor_at(address, lane)
     wrong = int(prepare_monitor_by(model, constants_address, plan_address, state))

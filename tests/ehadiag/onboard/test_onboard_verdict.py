@@ -26,6 +26,7 @@ from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.export.library import exported_unit, library_plan
 from ehadiag.identify.estimates import FIRST_STAGE_STD, friction_range
 from ehadiag.identify.identification_session import NuisanceMode
+from ehadiag.identify.prior import DAILY_PRIORS
 from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.model.registry import unit_constants
 from ehadiag.monitor.monitor_memory import MONITOR_PLAN_SIZE
@@ -283,7 +284,12 @@ def test_what_viscosity_of_the_day_moves_counts_in_the_deviation(off):
     new = np.array(unit_constants(ACTUATOR), dtype=np.float64)
     plan = np.concatenate([PLAN, *(new * (1.0 + 5e-4 * row) for row in np.eye(len(new))[:3])])
     plan[PLAN_DIRECTIONS] = 3.0
-    plan[MONITOR_PLAN_SIZE + VerdictRules._fields.index("most_excess")] = math.inf
+    for name, value in (
+        ("most_excess", math.inf),
+        ("viscosity_std", DAILY_PRIORS["oil_viscosity"].std),
+        ("supply_std", DAILY_PRIORS["supply_pressure"].std),
+    ):
+        plan[MONITOR_PLAN_SIZE + VerdictRules._fields.index(name)] = value
     recording = read_recording(LOGS / "healthy-open.blf")
     unit, memory = np.array(surrounded(recording)), np.zeros(ONBOARD.end)
     unit[UNIT_VISCOSITY] /= 1.0 + 0.038 * off
