@@ -35,6 +35,7 @@ from ehadiag.onboard.onboard_memory import (
     PLAN_DIRECTIONS,
     PROGRESS,
     REASONS,
+    UNIT_VISCOSITY,
     UNKNOWNS_MATRIX_SIZE,
     OnboardOutcome,
     VerdictRules,
@@ -482,7 +483,8 @@ def start_day(address: int, plan_address: int, plan: Array) -> None:
             trial[i] = point[i]
         i = _moved_by(lane)
         if 0 < lane < DAY_MODELS:
-            step[i] = DIFFERENCES.considered_step
+            # Of cold oil less: what viscosity does to the pressure grows with it.
+            step[i] = DIFFERENCES.considered_step / max(p[ONBOARD.unit + UNIT_VISCOSITY], 1.0)
             if lane <= ONBOARD_GENES:
                 width = min(math.sqrt(ROUNDS.width * p[ONBOARD.believed + i]), MAX_STEP)
                 step[i] = width if trial[i] + width <= 1.0 else -width
