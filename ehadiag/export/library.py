@@ -186,8 +186,9 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
     levels, (outliers, rms) = Levels(), residual_limits(actuator.calibration)
     prior, valve = unit_prior(actuator), actuator.servovalve
     low, high = prior.exponents
-    calibrated = actuator.calibration is not None
-    exact = not calibrated and low == high and not any(prior.discrepancy.values())
+    calibration = actuator.calibration
+    explained = calibration is None or calibration.fit.left == 0.0
+    exact = explained and low == high and not any(prior.discrepancy.values())
     _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
     return VerdictRules(
         advisory=levels.advisory,
@@ -197,7 +198,7 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         # Where nothing is in doubt but the noise, what is left is an effect; the package frees it.
         most_outliers=FIT.max_outliers_of_noise if exact else outliers,
         most_rms=rms,
-        most_excess=FIT.max_excess_without_nuisances if exact else math.inf,
+        most_excess=FIT.max_excess_without_nuisances if exact and calibration is None else math.inf,
         search_outliers=max(FIT.max_fit_outliers, outliers - FIT.max_outlier_share),
         most_anchored=float(FIT.max_anchor_count),
         most_std=FIT.max_shown_std,
@@ -207,8 +208,8 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         least_supply=RECORDING.min_supply_pressure_share * valve.PSR,
         **{f"discrepancy_{name}": prior.std.get(name, 0.0) for name in FAULT_LAWS},
         **{f"law_{name}": size for name, size in prior.discrepancy.items()},
-        viscosity_std=DAILY_PRIORS["oil_viscosity"].std if calibrated else BUS_VISCOSITY_STD,
-        supply_std=DAILY_PRIORS["supply_pressure"].std if calibrated else BUS_SUPPLY_STD,
+        viscosity_std=DAILY_PRIORS["oil_viscosity"].std if calibration else BUS_VISCOSITY_STD,
+        supply_std=DAILY_PRIORS["supply_pressure"].std if calibration else BUS_SUPPLY_STD,
         exponents=high - low,
         first_stage=FIRST_STAGE_STD,
         friction_new=valve.FSS0 / valve.FSS1 if low < high else 0.0,
