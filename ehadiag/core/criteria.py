@@ -149,7 +149,7 @@ class FitCriteria(msgspec.Struct, frozen=True):
     bound_tolerance: float = 1e-6
     """Distance of a severity from its bound at which it is on it, 1."""
     max_fit_outliers: float = 0.01
-    """Largest share of residuals beyond three deviations that needs no further search, 1."""
+    """Largest share of residuals beyond three deviations that needs no further unknowns, 1."""
     max_start_outliers: float = 0.15
     """Largest share of outliers of a start for the severities alone, 1: mostly 0.04 at most on a
     textbook's actuator, 0.29 and more on others; between break-aways a search may end away from the
@@ -157,9 +157,9 @@ class FitCriteria(msgspec.Struct, frozen=True):
     max_anchor_count: int = 4
     """Largest number of re-anchorings at an optimum, 1: in all but one of 200 tests there were
     none."""
-    max_outliers_for_search: float = 0.05
-    """Largest share of outliers after a refinement for which a further search is made, 1: 0.04 at
-    most on a textbook's actuator."""
+    max_outliers_near: float = 0.05
+    """Largest share of outliers of a point that is near the optimum, so that residuals there show
+    the noise, 1: 0.04 at most on a textbook's actuator."""
     max_excess_without_nuisances: float = 1.2
     """Largest excess that needs no nuisances, 1: 1.15 at most in 80 recordings of units without
     any."""

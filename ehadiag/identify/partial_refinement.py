@@ -204,7 +204,7 @@ def refine_near(
     cross = CoordinateCross.about(model, start_density(model, start, NEAR.look_std))
     runs = model.many(cross.points)
     at_start = _start_residuals(free, runs[0])
-    if at_start.outlier_share > FIT.max_outliers_for_search:
+    if at_start.outlier_share > FIT.max_outliers_near:
         return None
     between()
     judged = _with_judged_noise(experiments, [item.ticks for item in experiments], runs[0])

@@ -290,7 +290,7 @@ MAX_DAY = 20.0
 """Largest step of viscosity and supply, in deviations, 1: there is some viscosity left."""
 DAY_MODELS = 1 + ONBOARD_GENES + ONBOARD_UNKNOWNS - ONBOARD_PARAMETERS
 """Models of a step of the day: at the point, and one for each unknown but the offsets."""
-NEAR_OUTLIERS = FIT.max_outliers_for_search
+NEAR_OUTLIERS = FIT.max_outliers_near
 """Largest share of outliers at which residuals show the noise, 1."""
 ATTEMPTS = 3.0
 """Attempts that there are, 1: from the first approximation, over the usual sizes about where that
