@@ -85,9 +85,6 @@ class BreakAwayRules(msgspec.Struct, frozen=True):
     """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
     event_cost: float = 30.0
     """Least cost of a block, beyond the usual one, with such a break-away."""
-    max_blocks: int = 2
-    """Largest number of blocks, one after the other, of the one break-away at a wrong tick with
-    which a recording is explained, 1: it may fall on the end of a block."""
     max_end_cost: float = 2.0
     """Cost of an end of a search, noise included, over the best one's, 1, up to which it differs by
     break-aways: of a unit with 0.08 % of hysteresis four of five ends cost 1.2 to 1.4 times as
@@ -238,8 +235,7 @@ def estimate_about(
         refined=refined,
         experiments=judged,
         covariance=covariance,
-        explained=settings.explains(refined.residuals)
-        or (alone and settings.explains(without_event(refined.residuals))),
+        explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
         starts=found.starts,
@@ -311,28 +307,12 @@ def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
 
     residuals, counted: shape (signals, N).
     """
-    costs = _block_costs(residuals)
-    ticks = len(costs) * BREAK_AWAYS.block
-    among = counted[:, :ticks].any(axis=0).reshape(len(costs), -1).any(axis=1)
-    over = costs[among] - np.median(costs)
-    return bool(over.max(initial=0.0) > BREAK_AWAYS.event_cost)
-
-
-def _block_costs(residuals: Array) -> Array:
-    """Cost of each block of ticks, all signals together, see `BREAK_AWAYS`; shape (blocks,)."""
     count = residuals.shape[1] // BREAK_AWAYS.block
     ticks = count * BREAK_AWAYS.block
-    costs = cauchy_costs(residuals[:, :ticks]).sum(axis=0)
-    return np.asarray(costs.reshape(count, -1).sum(axis=1))
-
-
-def without_event(residuals: Array) -> Array:
-    """Residuals without the blocks of the costliest break-away at a wrong tick."""
-    together = np.convolve(_block_costs(residuals), np.ones(BREAK_AWAYS.max_blocks), "valid")
-    first = int(np.argmax(together)) * BREAK_AWAYS.block
-    left = residuals.copy()
-    left[:, first : first + BREAK_AWAYS.max_blocks * BREAK_AWAYS.block] = 0.0
-    return left
+    costs = cauchy_costs(residuals[:, :ticks]).sum(axis=0).reshape(count, -1).sum(axis=1)
+    among = counted[:, :ticks].any(axis=0).reshape(count, -1).any(axis=1)
+    over = costs[among] - np.median(costs)
+    return bool(over.max(initial=0.0) > BREAK_AWAYS.event_cost)
 
 
 def optima_covariance(found: MultistartResult, scale: Array) -> Array:

@@ -287,7 +287,10 @@ MAX_DIRECTION_CHANGE = 3.0
 calibration's directions are larger than what the package considers, 0.3 for an eighth of a
 deviation."""
 MAX_DAY = 20.0
-"""Largest step of viscosity and supply, in deviations, 1: there is some viscosity left."""
+"""Largest viscosity and supply by the sensors of a calibrated unit, in deviations, 1: there is some
+viscosity left."""
+MAX_ROUNDING = math.sqrt(3.0)
+"""Largest one by the bus's steps, in deviations, 1: half a step. A break-away may ask for more."""
 DAY_MODELS = 1 + ONBOARD_GENES + ONBOARD_UNKNOWNS - ONBOARD_PARAMETERS
 """Models of a step of the day: at the point, and one for each unknown but the offsets."""
 NEAR_OUTLIERS = FIT.max_outliers_near
@@ -545,10 +548,15 @@ def end_day(address: int, plan: Array) -> None:
     for i in range(ONBOARD_PARAMETERS, ONBOARD_UNKNOWNS):
         normal[i, i] += 1.0
         pull[i] += point[i]
+    far = MAX_DAY if direction_count(plan) > 0 else MAX_ROUNDING
     if onboard_bounded_step(point, normal, pull, ONBOARD_GENES, 0.0, 1.0, matrix, column, out):
+        share = 1.0
+        for i in range(ONBOARD_PARAMETERS, ONBOARD_UNKNOWNS):
+            ahead = math.copysign(far, out[i] - point[i]) - point[i]
+            if abs(out[i]) > far:
+                share = min(share, max(ahead / (out[i] - point[i]), 0.0))
         for i in range(ONBOARD_UNKNOWNS):
-            far = MAX_DAY if i >= ONBOARD_PARAMETERS else math.inf
-            point[i] = min(max(out[i], -far), far)
+            point[i] += share * (out[i] - point[i])
     for i in range(ONBOARD_GENES):
         shown = inverse_column(normal, i, matrix, column) > 0.0
         p[ONBOARD.considered + i] = 0.0

@@ -20,7 +20,7 @@ from ehadiag.identify.estimates import excess_cost, is_noise
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.identification_session import NuisanceMode, identify
 from ehadiag.identify.linearisation import ParameterDensity, linearised_by_regression
-from ehadiag.identify.nuisance_estimate import optima_covariance, without_event
+from ehadiag.identify.nuisance_estimate import optima_covariance
 from ehadiag.identify.nuisance_search import MultistartResult, StartEnd, multistart_search
 from ehadiag.identify.posterior import MANY_UNKNOWNS_SCHEDULE, cauchy_cost, search_posterior
 from ehadiag.identify.prior import (
@@ -432,13 +432,3 @@ def test_a_reversed_sensor_is_explained_by_nothing():
     result = identify([replace(experiment, spool=-experiment.spool)])
     assert result.fit.outliers > 0.015
     assert result.evaluations < 4000
-
-
-@pytest.mark.parametrize(("events", "explained"), [(1, True), (2, False)])
-def test_one_break_away_at_a_wrong_tick_leaves_noise_beside_it(events, explained):
-    residuals = np.random.default_rng(5).standard_normal((2, 5500))
-    for event in range(events):
-        start = 1190 + 2000 * event  # over the end of a block
-        residuals[:, start : start + 25] += 60.0
-    assert not is_noise(residuals)
-    assert is_noise(without_event(residuals)) is explained
