@@ -173,7 +173,7 @@ def _window_numbers(windows: Sequence[TimeWindow], rate: float) -> list[float]:
 
 BUS_VISCOSITY_STD: Final = 2.5e-3
 """Deviation of the oil's viscosity by the default bus's steps of 0.1 K at -20 degC, relative, 1; of
-hotter oil it is less, and does less."""
+hotter oil it is less, and does less. A bus with coarser steps errs by more than that."""
 BUS_SUPPLY_STD: Final = 4.1e3
 """Deviation of the supply by the default bus's steps of 0.01 MPa of supply and return, Pa."""
 

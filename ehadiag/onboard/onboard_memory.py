@@ -287,9 +287,9 @@ class VerdictRules(NamedTuple):
     most_excess: float
     """Excess of the residuals over noise that it may have, 1."""
     search_outliers: float
-    """Share of residuals beyond three deviations that needs no further search."""
+    """Share of residuals beyond three deviations that needs no further attempt."""
     most_anchored: float
-    """Times that the model may be put back on the spool without a further search."""
+    """Times that the model may be put back on the spool without a further attempt."""
     most_std: float
     """Standard deviation from which on the test does not show a severity."""
     most_lost: float

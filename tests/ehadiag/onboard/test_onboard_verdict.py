@@ -277,6 +277,21 @@ def test_an_effect_that_the_library_does_not_know_is_refused():
     assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.unexplained)
 
 
+@pytest.mark.parametrize("off", [-0.5, 0.5])
+def test_a_step_of_the_bus_in_cold_oil_moves_no_severity(off):
+    """Without a calibration, by half a step of 0.1 K: jack friction would be 8 deviations off."""
+    severities = {"Kintas": 0.3, "FSS": 0.4, "FDJ": 0.5}
+    recording = simulate_test("open", oil_temperature=-15.0, seed=2, **severities)
+    unit = np.array(surrounded(recording))
+    unit[UNIT_VISCOSITY] = relative_viscosity(-15.0 + 0.1 * off)
+    code, memory = run(unit, ticks_of(recording), 1e9)
+    assert code == 0
+    found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+    assert found.verdict == 10.0
+    for value, std, true in zip(found[:3], found[3:6], severities.values(), strict=True):
+        assert abs(value - true) < 5.0 * std < 0.005
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("off", [-3.0, -1.5, 1.5])
 def test_what_viscosity_of_the_day_moves_counts_in_the_deviation(off):
