@@ -47,7 +47,8 @@ MIN_SQUARE_EFFECT_CHANGE = 1e-300
 def learn_further_effects(session: CalibrationSession, model: UnitModel) -> LearnedModel:
     """Learn further effects beside those of a model, from open loop.
 
-    Returns with those that the recordings ask for, or, where that explains more, with all.
+    model: with a smooth hysteresis. Returns with those that the recordings ask for, or, where that
+    explains more, with all.
     """
     best = _learn_effects(session, model, QUICK_EFFECTS, 0)
     if best.estimated.excess <= SEARCHES.max_excess_repeated:
@@ -229,13 +230,7 @@ def choose_model(
                 return out
     if any(item.estimated.explained for item in out):
         return out
-    return [*out, *_rich_models(session, simple, _better_plays(simple[0], out))]
-
-
-def _better_plays(model: UnitModel, tried: Sequence[LearnedModel]) -> int:
-    """Plays with which a simple model explains more: further effects bend what they do not fit."""
-    alike = (item for item in tried if replace(item.model, plays=model.plays) == model)
-    return min(alike, key=lambda item: item.criterion).model.plays
+    return [*out, *_rich_models(session, simple)]
 
 
 def _learn_chambers(session: CalibrationSession, first: UnitModel) -> list[LearnedModel]:
@@ -294,17 +289,15 @@ def _leaves_as_much(found: LearnedModel, before: LearnedModel) -> bool:
     return found.model == before.model and found.estimated.excess > least
 
 
-def _rich_models(
-    session: CalibrationSession, simple: Sequence[UnitModel], plays: int
-) -> list[LearnedModel]:
+def _rich_models(session: CalibrationSession, simple: Sequence[UnitModel]) -> list[LearnedModel]:
     """Learn further effects with one second stage after the other, until one leaves little.
 
-    plays: of the hysteresis. Where the spool is explained and the pressure is far from it the other
-    second stage comes first, before the effects are looked for again.
+    Where the spool is explained and the pressure is far from it the other one comes first, before
+    the effects are looked for again.
     """
     out: list[LearnedModel] = []
     for model in simple:
-        found = learn_further_effects(session, replace(model, plays=plays))
+        found = learn_further_effects(session, replace(model, plays=PLAYS_OF_SMOOTH_HYSTERESIS))
         if not _is_of_the_pressure(found):
             found = relearn_further_effects(session, found)
         out.append(found)
