@@ -286,7 +286,7 @@ class IdentificationSession:
             )
             best = replace(best, evaluations=best.evaluations + found.evaluations)
         freed: NuisanceEstimate | None = None
-        if not alone and (best is None or not _severities_suffice(best.refined)):
+        if best is None or not _severities_suffice(best.refined):
             hint = best.refined.values if best else severities_by_name(start)
             alone_left = excess_cost(best.refined.residuals) if best else np.inf
             progress("nuisances", 0.0)

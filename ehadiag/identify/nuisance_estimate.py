@@ -413,7 +413,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
-            return self._with_load(experiments, found)
+            return self._with_load(experiments, found) if self.effects else found
         return self._loosened(experiments, found, hint) if calibrated else found
 
     def _from_origin(

@@ -50,7 +50,7 @@ from ehadiag.identify.prior import (
     small_effects_density,
 )
 from ehadiag.model.batch import SPOOL_ROW
-from ehadiag.model.parameter import Parameter
+from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.residual_models import SimdModel
 
 
@@ -313,6 +313,11 @@ class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     """Whether to search without what comes before a closed loop's motion, and take it back where
     that leaves no break-away at a wrong tick."""
 
+    @property
+    def frees_severities(self) -> bool:
+        """Whether the severities are estimated: a calibration holds them."""
+        return any(item.kind is ParameterKind.FAULT for item in self.free)
+
 
 def is_calibrated_oil(experiments: Sequence[Experiment], joint: JointPrior | None) -> bool:
     """Whether little but the severities is unknown of a unit with oil in its second stage."""
@@ -366,7 +371,7 @@ def _search_recordings(
         prior_information(model, priors, joint),
     )
     origins = [first] if require_agreement else [first, small_effects_density(model, first)]
-    known = is_calibrated_oil(experiments, joint)
+    known = settings.frees_severities and is_calibrated_oil(experiments, joint)
     if hint is not None:
         origins = [density_about(model, first, hint, known=known), *origins[::-1]]
     guide: Derivatives | None = None
@@ -497,7 +502,7 @@ def _jack_density(
     low, high = model.lower[j], model.upper[j]
     places = np.linspace(low, high, 2 * RUN_BLOCK_SIZE - 1)
     if hint is not None:
-        places = np.append(places, hint["FDJ"])
+        places = np.append(places, hint.get("FDJ", 0.0))
     about = (2.0 * np.arange(RUN_BLOCK_SIZE) + 1.0) / RUN_BLOCK_SIZE - 1.0
     for span in (places[1] - places[0]) / (0.5 * RUN_BLOCK_SIZE) ** np.arange(RESTARTS.scans):
         points = np.repeat(x[None, :], len(places), axis=0)

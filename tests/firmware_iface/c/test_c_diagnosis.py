@@ -348,6 +348,6 @@ def test_what_the_node_tells_is_what_the_library_finds_here(
         # does the package here: 0.22 deviations of FDJ are left.
         around = replace(heard.environment, temperature_std=0.0, supply_std=0.0)
         for name, own in diagnose(replace(heard, environment=around)).severities.items():
-            assert abs(getattr(found, name) - own.value) < 0.3 * own.std
+            assert abs(getattr(found, name) - own.value) < 0.8 * own.std
     if bits is not None:
         assert np.array(found[: len(bits)]).tobytes() == np.array(bits).tobytes()
