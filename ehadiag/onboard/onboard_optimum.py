@@ -529,7 +529,8 @@ def add_day(address: int, plan: Array, k: int) -> None:
             shift[i] += slope[i] * lead
             for j in range(ONBOARD_UNKNOWNS):
                 normal[i, j] += slope[i] * slope[j]
-    _spread_scores(scores, square_at(address, ONBOARD.meat, ONBOARD_UNKNOWNS), k)
+    if p[PROGRESS.phase] == PHASES.last_day:  # by the first step nothing is judged
+        _spread_scores(scores, square_at(address, ONBOARD.meat, ONBOARD_UNKNOWNS), k)
 
 
 @bare_kernel
