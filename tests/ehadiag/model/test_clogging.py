@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from effect_cases import MODELS, batch_of, residuals_of, rms, severities, simulated
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import optimize
 
@@ -140,11 +140,15 @@ def test_the_bridge_is_that_of_its_orifices(k, load):
     viscous=st.floats(0.0, 2.0),
     x=st.floats(0.05, 1.1),
 )
+@example(k=0.25, share=1.0, viscous=0.0, x=1.0)
 def test_a_bridge_balances_up_to_its_stall(k, share, viscous, x):
     """Friction of any size and cold oil; Newton's method had speeds of -12 and +900."""
     part, near, far = k * k, max(1.0 - x, 0.0), 1.0 + x
     load = share * bridge_load(part, near, far, 0.0)[0]
-    assert bridge_stall(part, load) <= x + 1e-7
+    stall = bridge_stall(part, load)
+    there = bridge_load(part, max(1.0 - stall, 0.0), 1.0 + stall, 0.0)[0]
+    # Where the nozzle closes the load has a kink, at which the rounds end early.
+    assert stall <= x + 1e-7 or abs(there - load) < 1e-6
     speed = bridge_speed(part, load, viscous, x)
     assert 0.0 <= speed <= math.sqrt(2.0) / k
     found = optimize.brentq(
