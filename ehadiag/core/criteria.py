@@ -1,4 +1,4 @@
-"""Every threshold of what is good enough, explained, hopeless to search on, or plausible.
+"""Every threshold of what is good enough, explained, beyond explanation, or plausible.
 
 Each has a quantity, a unit and how it was set: by the statistics of noise, by a bound, by a source,
 or by a study whose command shows it. Those that no study is named for are bounds of judgement.

@@ -281,9 +281,9 @@ class IdentificationSession:
         start, near = self._refinement_start(experiments, start, found.best)
         best: SeverityAttempt | None = None
         if alone or (near and self.nuisances is NuisanceMode.AUTO and not has_inexact_data):
-            best = refined_attempt(
-                experiments, found, start, self._first_part, partial(progress, "refinement", 0.0)
-            )
+            between = partial(progress, "refinement", 0.0)
+            first_part = self._first_part(experiments, start, between)
+            best = refined_attempt(experiments, found, first_part, between)
             best = replace(best, evaluations=best.evaluations + found.evaluations)
         freed: NuisanceEstimate | None = None
         if best is None or not _severities_suffice(best.refined):

@@ -1,6 +1,6 @@
 """Refinement of the severities alone, of a unit assumed to match its data file.
 
-On the first part of a test while it runs, and the step that its last part adds.
+It begins on the first part of a test while that runs; the last part adds a step.
 
 The optimum of the first part stands with its normal matrix; one Gauss-Newton step on the residuals
 of the last part leads to the optimum of the whole (a measurement update of the information filter).
@@ -394,21 +394,15 @@ class SeverityAttempt(msgspec.Struct, frozen=True, eq=False):
     """Of the refinement."""
 
 
-FirstPartRefinement = Callable[[Sequence[Experiment], Array, Callable[[], None]], FirstPart]
-"""Refinement on the first parts of the tests, from a start among the severities; the last argument
-is called between rounds."""
-
-
 def refined_attempt(
     experiments: Sequence[Experiment],
     found: SearchResult,
-    start: Array,
-    first_parts: FirstPartRefinement,
+    first: FirstPart,
     between: Callable[[], None] = no_interruption,
 ) -> SeverityAttempt:
-    """Refine from a start after a search; what `between` raises between rounds ends it."""
+    """Refine whole tests from their first parts, after a search; what `between` raises between
+    rounds ends it."""
     until = [first_part_ticks(item) for item in experiments]
-    first = first_parts(experiments, start, between)
     judged = first.judged(experiments)
     best = add_last_part(judged, until, first)
     if best is None:

@@ -22,7 +22,6 @@ from ehadiag.monitor.monitor_memory import (
 )
 from ehadiag.onboard.onboard_memory import (
     DIRECTIONS_OF_PASS,
-    MATRIX_SIZE,
     ONBOARD,
     ONBOARD_GENES,
     ONBOARD_MODELS,
@@ -312,8 +311,6 @@ def start_conclusion(address: int, plan_address: int, plan: Array) -> None:
     """Prepare the models about an optimum, to judge it."""
     p = array_at(address, (ONBOARD.end,))
     start_round(address, plan_address, plan)
-    for i in range(MATRIX_SIZE):
-        p[ONBOARD.meat + i] = 0.0
     clear_channels(channel_sums_at(address))
     clear_histograms(p)
 
@@ -323,17 +320,8 @@ def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
     """Add a tick, to which the models are advanced, to what judges an optimum."""
     p, sums = array_at(address, (ONBOARD.end,)), channel_sums_at(address)
     rules = verdict_rules_of(plan)
-    normal = square_at(address, ONBOARD.normal, ONBOARD_PARAMETERS)
-    shift = parameters_at(address, ONBOARD.normal + MATRIX_SIZE)
     slope = parameters_at(address, ONBOARD.slope)
     along = array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES, 3))
-    scores = array_at(
-        address + BYTES_PER_NUMBER * ONBOARD.scores,
-        (ESTIMATION.correlation_lags + 1, ONBOARD_PARAMETERS),
-    )
-    now = k % (ESTIMATION.correlation_lags + 1)
-    for i in range(ONBOARD_PARAMETERS):
-        scores[now, i] = 0.0
     for c in range(2):
         raw = p[ONBOARD.monitors + MONITOR.residual + c]
         count_residual(p, c, raw, sums[c, LAST], sums[c, EARLIER])
@@ -364,13 +352,6 @@ def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
             continue
         p[USED_SQUARES] += r * r
         p[USED] += 1.0
-        lead = _sampling_shift(p, plan) if c == 0 else 0.0
-        for i in range(ONBOARD_PARAMETERS):
-            scores[now, i] += slope[i] * r
-            shift[i] += slope[i] * lead
-            for j in range(ONBOARD_PARAMETERS):
-                normal[i, j] += slope[i] * slope[j]
-    _spread_scores(scores, square_at(address, ONBOARD.meat, ONBOARD_PARAMETERS), k)
 
 
 @inlined_exact
