@@ -39,6 +39,7 @@ from ehadiag.model.registry import parameter
 from ehadiag.model.residual_models import SimdModel
 
 QUICK_EFFECTS = tuple(name for name in FURTHER_EFFECTS if name not in SLOW_EFFECTS)
+SKEW_NAME = "hysteresis_skew"
 TRIAL_SIZES_OF_EFFECT = (0.1, 0.3, 1.0, 2.0)
 """Sizes of an effect over its usual one, 1, that are tried."""
 MIN_SQUARE_EFFECT_CHANGE = 1e-300
@@ -230,7 +231,7 @@ def choose_model(
                 return out
     if any(item.estimated.explained for item in out):
         return out
-    return [*out, *_rich_models(session, simple)]
+    return [*out, *(_with_one_play(session, item) for item in _rich_models(session, simple))]
 
 
 def _learn_chambers(session: CalibrationSession, first: UnitModel) -> list[LearnedModel]:
@@ -308,6 +309,23 @@ def _rich_models(session: CalibrationSession, simple: Sequence[UnitModel]) -> li
         return out
     again = relearn_further_effects(session, best)
     return out if again is best else [*out, again]
+
+
+def _with_one_play(session: CalibrationSession, found: LearnedModel) -> LearnedModel:
+    """Learn with one play where a smooth hysteresis leans to its widest plays, if it costs no more.
+
+    Such a hysteresis is nearly one play, but for small changes of the current, by which a diagnosis
+    would tell friction from it.
+    """
+    if found.estimated.refined.values.get(SKEW_NAME, 0.0) >= 0.0:
+        return found
+    names = significant_effects(found)
+    if SKEW_NAME not in names:
+        return found
+    others = tuple(name for name in names if name != SKEW_NAME)
+    one_play = _learn_from(session, replace(found.model, plays=1), others, found, 0)
+    more = one_play.criterion - found.criterion
+    return one_play if more < SEARCHES.max_same_cost_difference else found
 
 
 def _is_of_the_pressure(found: LearnedModel) -> bool:

@@ -180,7 +180,9 @@ def test_displaced_lands_and_a_bent_torque_are_told_from_all_else():
     assert found.reasons == ()
     assert found.actuator is not None
     assert found.actuator.calibration is not None
+    assert found.actuator.calibration.plays == 1
     learned = found.actuator.calibration.effects
+    assert learned["hysteresis"] == pytest.approx(effects.hysteresis, rel=0.02)
     assert learned["land_shift"] == pytest.approx(SHIFT, rel=0.03)
     assert learned["torque_odd"] == pytest.approx(0.03, rel=0.05)
     basic = {"null_bias", "torque_motor_gain", "hysteresis", "backlash"}

@@ -55,9 +55,9 @@ def left(spool, pressure):
 class Told:
     """A session whose searches leave what the test says, by the model, and keep what was asked."""
 
-    def __init__(self, leaves, hysteresis=0.02):
-        self.leaves = leaves
-        self.values = {"hysteresis": hysteresis}
+    def __init__(self, leaves, hysteresis=0.02, skew=0.0, costs=lambda _model: 0.0):
+        self.leaves, self.costs = leaves, costs
+        self.values = {"hysteresis": hysteresis, SKEW: skew}
         self.start = default_actuator()
         self.recordings = (None, None)
         self.asked = []
@@ -73,7 +73,7 @@ class Told:
         part = how.get("part", RecordingSelection.ALL)
         experiments = [None] * (1 if part is RecordingSelection.OPEN_LOOP else 2)
         return SimpleNamespace(
-            model=model, estimated=estimated, experiments=experiments, criterion=0.0
+            model=model, estimated=estimated, experiments=experiments, criterion=self.costs(model)
         )
 
     @property
@@ -150,6 +150,31 @@ def test_where_neither_stage_explains_the_better_one_is_looked_for_again(further
     session, model = chosen(lambda model: (0.0, 9.0) if model.rich else (5.0, 9.0))
     assert len(model.beside) == 2
     assert {item.second_stage for item in session.models} == {"linear", "orifice"}
+
+
+@pytest.mark.parametrize(
+    ("skew", "asked_for", "more", "plays"),
+    [
+        (-6.0, True, 20.0, 1),
+        (-6.0, True, 40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
+        (-6.0, False, -40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
+        (6.0, True, -40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
+    ],
+)
+def test_a_hysteresis_that_leans_to_its_widest_plays_is_one_play_if_that_costs_no_more(
+    further, monkeypatch, skew, asked_for, more, plays
+):
+    """With the skewed one `FSS` was 0.00 (0 … 0.03) and sure for 0.51, in closed loop."""
+    names = (SKEW, "load") if asked_for else ("load",)
+    monkeypatch.setattr(model_choice, "significant_effects", lambda _found: names)
+    session = Told(
+        lambda model: (0.0, 0.0) if model.rich else (5.0, 9.0),
+        skew=skew,
+        costs=lambda model: more if model.rich and model.plays == 1 else 0.0,
+    )
+    model = choose_model(session, session.start, compare=False)[-1].model
+    assert model.plays == plays
+    assert model.beside == (("load",) if plays == 1 else (SKEW,))
 
 
 def test_a_comparison_tries_all():
