@@ -10,7 +10,7 @@ spool breaks away seldom, and a search finds the optimum.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from msgspec.structs import replace
@@ -33,6 +33,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.identify.estimates import estimate_covariance, is_pressure_misfit, signal_excess_costs
 from ehadiag.identify.experiment import lay_out_spans, share_offsets, unknowns_of
+from ehadiag.identify.nuisance_estimate import HYSTERESIS_NAME
 from ehadiag.identify.ring import SPOOL_PARAMETERS, find_ring, is_same_ring, ring_prior
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.registry import parameter
@@ -117,7 +118,8 @@ def _learn_more_effects(
     if best.estimated.explained:
         return best
     names = {*more, *significant_effects(best)}
-    found = _learn_effects(session, best.model, names, turn, None if afresh else best)
+    begin = None if afresh else best.estimated.refined.values
+    found = _learn_effects(session, best.model, names, turn, begin)
     return min(best, found, key=_rank)
 
 
@@ -126,14 +128,15 @@ def _learn_effects(
     model: UnitModel,
     names: Collection[str],
     turn: int,
-    begin: LearnedModel | None = None,
+    begin: Mapping[str, float] | None = None,
 ) -> LearnedModel:
     """Learn some effects, and then those of them that are asked for, if need be."""
     found = _learn_from(session, model, ordered_effects(names), begin, turn)
     if found.estimated.excess > SEARCHES.min_excess_slow or not set(SLOW_EFFECTS).intersection(
         names
     ):
-        fewer = _learn_from(session, model, significant_effects(found), found, turn)
+        values = found.estimated.refined.values
+        fewer = _learn_from(session, model, significant_effects(found), values, turn)
         found = min(found, fewer, key=_rank)
     return found
 
@@ -142,15 +145,15 @@ def _learn_from(
     session: CalibrationSession,
     model: UnitModel,
     names: tuple[str, ...],
-    begin: LearnedModel | None,
+    begin: Mapping[str, float] | None,
     turn: int,
 ) -> LearnedModel:
-    """Learn with these further effects, beginning where another search ended."""
+    """Learn with these further effects, beginning about these values by name."""
     usual = {name: FURTHER_EFFECTS[name].mean for name in SLOW_EFFECTS}
     return session.learn(
         replace(model, beside=names),
         nearly_new=True,
-        hint={**usual, **begin.estimated.refined.values} if begin else None,
+        hint={**usual, **begin} if begin else None,
         budget=SEARCHES.max_runs_one_start,
         part=RecordingSelection.OPEN_LOOP,
         turn=turn,
@@ -314,16 +317,19 @@ def _rich_models(session: CalibrationSession, simple: Sequence[UnitModel]) -> li
 def _with_one_play(session: CalibrationSession, found: LearnedModel) -> LearnedModel:
     """Learn with one play where a smooth hysteresis leans to its widest plays, if it costs no more.
 
-    Such a hysteresis is nearly one play, but for small changes of the current, by which a diagnosis
-    would tell friction from it.
+    Such a hysteresis is nearly one play of its mean width, but for small changes of the current, by
+    which a diagnosis would tell friction from it.
     """
-    if found.estimated.refined.values.get(SKEW_NAME, 0.0) >= 0.0:
-        return found
-    names = significant_effects(found)
+    values = found.estimated.refined.values
+    skew, count = values.get(SKEW_NAME, 0.0), found.model.plays
+    names = significant_effects(found) if skew < 0.0 else ()
     if SKEW_NAME not in names:
         return found
+    places = (np.arange(count) + 0.5) / count
+    mean_place = float(np.average(places, weights=np.exp(-skew * places)))
+    begin = {**values, HYSTERESIS_NAME: 2.0 * mean_place * values[HYSTERESIS_NAME]}
     others = tuple(name for name in names if name != SKEW_NAME)
-    one_play = _learn_from(session, replace(found.model, plays=1), others, found, 0)
+    one_play = _learn_from(session, replace(found.model, plays=1), others, begin, 0)
     more = one_play.criterion - found.criterion
     return one_play if more < SEARCHES.max_same_cost_difference else found
 
