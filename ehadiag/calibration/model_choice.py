@@ -322,13 +322,12 @@ def _with_one_play(session: CalibrationSession, found: LearnedModel) -> LearnedM
     """
     values = found.estimated.refined.values
     skew, count = values.get(SKEW_NAME, 0.0), found.model.plays
-    names = significant_effects(found) if skew < 0.0 else ()
-    if SKEW_NAME not in names:
+    if skew > SEARCHES.max_skew_of_one_play:
         return found
     places = (np.arange(count) + 0.5) / count
     mean_place = float(np.average(places, weights=np.exp(-skew * places)))
     begin = {**values, HYSTERESIS_NAME: 2.0 * mean_place * values[HYSTERESIS_NAME]}
-    others = tuple(name for name in names if name != SKEW_NAME)
+    others = tuple(name for name in significant_effects(found) if name != SKEW_NAME)
     one_play = _learn_from(session, replace(found.model, plays=1), others, begin, 0)
     more = one_play.criterion - found.criterion
     return one_play if more < SEARCHES.max_same_cost_difference else found

@@ -118,6 +118,9 @@ class SearchRules(msgspec.Struct, frozen=True):
     """Residuals over noise, 1, up to which no slow search is made for a little more."""
     max_spool_excess_other_stage: float = 1.5
     """Spool residuals over noise, 1, up to which the other second stage may explain the rest."""
+    max_skew_of_one_play: float = -1.0
+    """Skew of a smooth hysteresis, 1, up to which it may be one play: the widest play counts 2.4
+    times the narrowest. Units of one play had -1.8 to -12."""
     min_effect_gain: float = 0.03
     """Share of the remaining cost, 1, that an effect must take away to be tried."""
     min_hysteresis_effects: float = 3e-3

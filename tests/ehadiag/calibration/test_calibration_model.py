@@ -153,26 +153,27 @@ def test_where_neither_stage_explains_the_better_one_is_looked_for_again(further
 
 
 @pytest.mark.parametrize(
-    ("skew", "asked_for", "more", "plays"),
+    ("skew", "more", "plays"),
     [
-        (-6.0, True, 20.0, 1),
-        (-6.0, True, 40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
-        (-6.0, False, -40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
-        (6.0, True, -40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
+        (-6.0, 20.0, 1),
+        (-6.0, 40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
+        (-0.3, -40.0, PLAYS_OF_SMOOTH_HYSTERESIS),
     ],
 )
 def test_a_hysteresis_that_leans_to_its_widest_plays_is_one_play_if_that_costs_no_more(
-    further, monkeypatch, skew, asked_for, more, plays
+    further, monkeypatch, skew, more, plays
 ):
     """With the skewed one `FSS` was 0.00 (0 … 0.03) and sure for 0.51, in closed loop."""
-    names = (SKEW, "load") if asked_for else ("load",)
-    monkeypatch.setattr(model_choice, "significant_effects", lambda _found: names)
+    monkeypatch.setattr(model_choice, "significant_effects", lambda _found: (SKEW, "load"))
     session = Told(
         lambda model: (0.0, 0.0) if model.rich else (5.0, 9.0),
         skew=skew,
         costs=lambda model: more if model.rich and model.plays == 1 else 0.0,
     )
     model = choose_model(session, session.start, compare=False)[-1].model
+    _, how = session.asked[-1]
+    if skew < -1.0:
+        assert how["hint"]["hysteresis"] == pytest.approx(0.02 * 1.656, rel=1e-3)
     assert model.plays == plays
     assert model.beside == (("load",) if plays == 1 else (SKEW,))
 
