@@ -116,8 +116,8 @@ NO_WINDOWS: Final = -1
 SEARCH_OF_SEVERITY: Final = (1, 2, 0)
 """Which search's windows a severity has, in the order of the plan (FDJ, Kintas, FSS)."""
 GENETIC_SEARCH: Final = 3
-PREPARATION: Final = 20.0
-"""Effort of the preparation of a model, in ticks of one."""
+PREPARATION: Final = 20.0 * ONBOARD_MODELS
+"""Effort of the preparation of all models, in ticks of one."""
 SPOOL_BACK: Final = 5
 """Ticks before a window in which the spool's last sample is looked for, 1."""
 MAX_TICKS: Final = 1e6
@@ -294,7 +294,7 @@ def end_pass(address: int, plan: Array) -> float:
 def continue_identification(
     address: int, plan_address: int, ticks_address: int, amounts: tuple[float, float]
 ) -> int:
-    """Continue an identification by at least so many ticks of a model, or to its end.
+    """Continue an identification by so many ticks of a model, or to its end; a tick is done whole.
 
     Addresses are those of an identification that was begun, of its plan, and of the recorded test
     with five numbers a tick, the same in every call; amounts: ticks of the recording, 1 … 1e6,
@@ -316,8 +316,10 @@ def continue_identification(
     while p[PROGRESS.phase] != PHASES.done and done < amounts[1]:
         if p[PROGRESS.tick] < 0.0:
             if p[PROGRESS.window] == 0.0:
+                if done > max(amounts[1] - PREPARATION, 0.0):
+                    break
                 start_pass(address, plan_address, plan)
-                done += PREPARATION * ONBOARD_MODELS
+                done += PREPARATION
             start_window(address, plan, ticks)
         k, end = int(p[PROGRESS.tick]), _window_end(address, plan, 1)
         while k < end and done < amounts[1]:

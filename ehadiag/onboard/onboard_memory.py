@@ -188,9 +188,11 @@ class OnboardPlaces(NamedTuple):
     influence: int
     """Columns of the unknowns' covariance that are of the severities."""
     moved: int
-    """Shifts of the severities by a deviation of each direction of the pass."""
+    """Shifts of the severities by a deviation of each direction of the pass, then the costs of the
+    break-aways that each moves."""
     considered: int
-    """Sum of their squares by all directions of what is held but not certain."""
+    """Sum of their squares by all directions of what is held but not certain, then the largest of
+    those costs."""
     noise: int
     """Noise of spool and pressure as the residuals show it, in units of the plan's."""
     normal: int
@@ -250,7 +252,8 @@ ONBOARD: Final = OnboardPlaces(
             ONBOARD_UNKNOWNS, ONBOARD_UNKNOWNS + 3, ONBOARD_UNKNOWNS, ONBOARD_GENES + 6,
             ONBOARD_GENES, ONBOARD_GENES, ONBOARD_GENES, ONBOARD_GENES, 2,
             ONBOARD_MODELS * (ONBOARD_GENES + 1), ONBOARD_GENES * ONBOARD_GENES, ONBOARD_GENES,
-            ONBOARD_GENES * ONBOARD_UNKNOWNS, DIRECTIONS_OF_PASS * ONBOARD_GENES, ONBOARD_GENES, 2,
+            ONBOARD_GENES * ONBOARD_UNKNOWNS, DIRECTIONS_OF_PASS * (ONBOARD_GENES + 1),
+            ONBOARD_GENES + 1, 2,
             UNKNOWNS_MATRIX_SIZE + ONBOARD_UNKNOWNS, ONBOARD_UNKNOWNS, UNKNOWNS_MATRIX_SIZE,
             ONBOARD_UNKNOWNS, 3 * ONBOARD_GENES,
             (ESTIMATION.correlation_lags + 1) * ONBOARD_UNKNOWNS, CHANNELS * CHANNEL_SUMS, SUMS,

@@ -10,10 +10,12 @@ from typing import Final
 from ehadiag.compile.elementary import exponential, logarithm, normal_cdf
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
+from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.linearisation import DIFFERENCES
+from ehadiag.identify.nuisance_estimate import BREAK_AWAYS
 from ehadiag.model.plant import PLANT_FIELDS
-from ehadiag.model.severities import FAULT_CHANGES
+from ehadiag.model.severities import FAULT_CHANGES, FAULT_LAWS
 from ehadiag.model.simd_layout import ROWS
 from ehadiag.monitor.monitor_memory import (
     MODEL,
@@ -119,6 +121,8 @@ def write_deviations(address: int, plan: Array, unknowns: int, reduced: float) -
         discrepancy = rules.discrepancy_Kintas
         if i == FSS:
             discrepancy = rules.discrepancy_FSS
+            if p[BREAK_AWAY_PLACE] > EVENT_COST:
+                considered += AMBIGUOUS_FRICTION_STD**2
         elif i == FDJ:
             discrepancy = rules.discrepancy_FDJ
         variance *= max(reduced / ESTIMATION.capped_variance, 1.0)
@@ -258,6 +262,10 @@ def onboard_chance_above(value: float, std: float, level: float) -> float:
     return 1.0 if value >= level else 0.0
 
 
+AMBIGUOUS_FRICTION_STD = FAULT_LAWS[FRICTION_NAME].ambiguous_std
+EVENT_COST = BREAK_AWAYS.event_cost
+BREAK_AWAY_COSTS_PLACE = ONBOARD.moved + DIRECTIONS_OF_PASS * ONBOARD_GENES
+BREAK_AWAY_PLACE = ONBOARD.considered + ONBOARD_GENES
 SPOOL_VELOCITY_PLACE = ONBOARD.monitors + MODEL.state + ROWS.spool_rate
 
 
@@ -284,7 +292,8 @@ MAX_STEP = 0.1
 MAX_DIRECTION_CHANGE = 3.0
 """Change of a residual by a direction, in deviations, from which on it is a break-away, 1: a
 calibration's directions are larger than what the package considers, 0.3 for an eighth of a
-deviation."""
+deviation. Where one comes at another tick with a direction that is off, no line shows what that
+does: the optimum is in another dip, and the friction as doubtful as in the package there."""
 MAX_DAY = 20.0
 """Largest viscosity and supply by the sensors of a calibrated unit, in deviations, 1: there is some
 viscosity left."""
@@ -539,6 +548,7 @@ def end_day(address: int, plan: Array) -> None:
                 share = min(share, max(ahead / (out[i] - point[i]), 0.0))
         for i in range(ONBOARD_UNKNOWNS):
             point[i] += share * (out[i] - point[i])
+    p[BREAK_AWAY_PLACE] = 0.0
     for i in range(ONBOARD_GENES):
         shown = inverse_column(normal, i, matrix, column) > 0.0
         p[ONBOARD.considered + i] = 0.0
@@ -561,7 +571,7 @@ def start_directions(address: int, plan_address: int, plan: Array, done: int) ->
     """
     p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
     step = array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES,))
-    for i in range(DIRECTIONS_OF_PASS * ONBOARD_GENES):
+    for i in range(DIRECTIONS_OF_PASS * (ONBOARD_GENES + 1)):
         p[ONBOARD.moved + i] = 0.0
     for lane in range(ONBOARD_MODELS):
         for i in range(ONBOARD_UNKNOWNS):
@@ -595,13 +605,14 @@ def add_directions(address: int) -> None:
             change = p[at + (1 + i) * MONITOR_SIZE] / noise - middle
             smooth = smooth and abs(change) < DIFFERENCES.max_kink
             slope[i] = change / p[ONBOARD.along + i]
-        if not smooth:
-            continue
-        for k in range(DIRECTIONS_OF_PASS):
+        for k in range(DIRECTIONS_OF_PASS if math.isfinite(middle) else 0):
             change = p[at + (1 + ONBOARD_GENES + k) * MONITOR_SIZE] / noise - middle
             if not abs(change) < MAX_DIRECTION_CHANGE:
+                p[BREAK_AWAY_COSTS_PLACE + k] += ROUNDS.cauchy_variances * logarithm(
+                    1.0 + change * change / ROUNDS.cauchy_variances
+                )
                 continue
-            for i in range(ONBOARD_GENES):
+            for i in range(ONBOARD_GENES if smooth else 0):
                 p[ONBOARD.moved + k * ONBOARD_GENES + i] += slope[i] * change
 
 
@@ -610,6 +621,7 @@ def end_directions(address: int) -> None:
     """Take what the directions of a pass move; one that there is not moves nothing."""
     p = array_at(address, (ONBOARD.end,))
     for k in range(DIRECTIONS_OF_PASS):
+        p[BREAK_AWAY_PLACE] = max(p[BREAK_AWAY_PLACE], p[BREAK_AWAY_COSTS_PLACE + k])
         for i in range(ONBOARD_GENES):
             p[ONBOARD.considered + i] += p[ONBOARD.moved + k * ONBOARD_GENES + i] ** 2
 

@@ -10,7 +10,7 @@
  *
  * and the background, at its leisure:
  *
- *     for (;;) (void)fcc_diagnosis_work(&diagnosis, 100.0);
+ *     for (;;) (void)fcc_diagnosis_work(&diagnosis, 50.0);
  *
  * What they share belongs to one of them at a time, as `stage` says: to the background while a test
  * waits to be identified or is, to the tick otherwise. On a computer with several cores the caller

@@ -114,7 +114,7 @@ int main(void)
     systick[2] = 0;
     systick[0] = 7;
     for (;;) {
-        if (!fcc_diagnosis_work(&diagnosis, 100.0)) {
+        if (!fcc_diagnosis_work(&diagnosis, 50.0)) {
             __asm__ volatile("wfi");
         }
         if (diagnosis.stage != FCC_DONE) {

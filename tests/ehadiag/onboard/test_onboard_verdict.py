@@ -29,7 +29,8 @@ from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.identify.prior import DAILY_PRIORS
 from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.model.registry import unit_constants
-from ehadiag.monitor.monitor_memory import MONITOR_PLAN_SIZE
+from ehadiag.model.severities import FAULT_LAWS
+from ehadiag.monitor.monitor_memory import MONITOR, MONITOR_PLAN_SIZE, MONITOR_SIZE
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard import onboard_optimum
 from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
@@ -125,6 +126,26 @@ def test_the_deviations_are_those_of_the_package():
     variance = np.maximum(variance, believed) + moved**2 + considered
     expected = np.sqrt(variance + ESTIMATION.discrepancy_std**2)
     assert memory[ONBOARD_GENES : 2 * ONBOARD_GENES] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(("ticks", "doubtful"), [(2, False), (4, True)])
+def test_a_break_away_that_a_calibration_moves_makes_friction_doubtful(ticks, doubtful):
+    """Two samples, four deviations off, are no break-away at another tick; four are one."""
+    memory = np.zeros(ONBOARD.end)
+    memory[ONBOARD.noise : ONBOARD.noise + 2] = 1.0
+    memory[ONBOARD.along : ONBOARD.along + ONBOARD_GENES] = 1.0
+    moved_model = ONBOARD.monitors + (1 + ONBOARD_GENES) * MONITOR_SIZE + MONITOR.residual
+    memory[moved_model] = 4.0
+    for _ in range(ticks):
+        onboard_optimum.add_directions(memory.ctypes.data)
+    onboard_optimum.end_directions(memory.ctypes.data)
+    normal = ONBOARD.normal + np.arange(ONBOARD_PARAMETERS) * (ONBOARD_PARAMETERS + 1)
+    memory[normal] = 1e8
+    assert onboard_optimum.write_deviations(memory.ctypes.data, PLAN, ONBOARD_PARAMETERS, 1.0) == 0
+    std = memory[ONBOARD_GENES : 2 * ONBOARD_GENES]
+    extra = FAULT_LAWS["FSS"].ambiguous_std if doubtful else 0.0
+    assert std[0] == std[2]
+    assert std[1] == pytest.approx(math.hypot(std[0], extra))
 
 
 @given(

@@ -4,7 +4,7 @@
 #include "ticks.h"
 
 #define RESULTS 17
-#define WORK 100.0 /* ticks of a model in a slice */
+#define WORK 50.0 /* ticks of a model in a slice */
 #define MILLION 1000000u
 
 static eha_identification identification;
