@@ -118,6 +118,9 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
     """How the samples were measured separately; None: they are the computer's own."""
     sampled: Array = msgspec.field(default_factory=lambda: np.empty(0))
     """When the channels of `acquired` were sampled, s on its clock; empty without it."""
+    creep_end: int = 0
+    """Ticks in which a model follows the spool's sensor, and what comes after a hold does not
+    count."""
 
     @property
     def ticks(self) -> int:
@@ -162,12 +165,7 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         if not self.creeps:
             return self
         end = _ticks_before_motion(self.test) + round(REST.creep_s * self.test.rate)
-        creeps = (np.arange(self.ticks) < end) & np.isfinite(self.pressure)
-        return replace(
-            self,
-            spool=np.where(creeps, np.nan, self.spool),
-            pressure=np.where(creeps, np.nan, self.pressure),
-        )
+        return replace(self, creep_end=end)
 
     def with_origin(self, offset: float) -> Experiment:
         """Return the same with the offset of the spool's sensor taken off an origin read by it."""
@@ -511,7 +509,9 @@ def lay_out_spans(
     weight, anchors, origins, places = [], [], [], []
     for index, first, a, b in parts:
         experiment = experiments[index]
-        inside = np.arange(first, b) >= a
+        ticks = np.arange(first, b)
+        held = np.isnan(experiment.pressure[first:b])
+        inside = (ticks >= a) & ((ticks >= experiment.creep_end) | held)
         on_spool = inside & np.isfinite(experiment.spool[first:b]) & channels[0]
         on_pressure = inside & np.isfinite(experiment.pressure[first:b]) & channels[1]
         rows = [on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise]
@@ -521,7 +521,12 @@ def lay_out_spans(
             )
             rows.append(on_position / experiment.position_noise)
         weight.append(np.vstack(rows))
-        anchor = NO_ANCHOR if anchor_lsb is None else experiment.anchor(anchor_lsb)
+        anchor = NO_ANCHOR
+        if anchor_lsb is not None:
+            anchor = experiment.anchor(anchor_lsb)
+        elif experiment.creep_end > first:
+            follows = experiment.anchor(ANCHOR_THRESHOLDS_LSB)
+            anchor = replace(follows, follow=0.0, until=experiment.creep_end - first)
         anchors.append(anchor.as_array())
         origins.append(_origin(experiment, first))
         places.append(_place(experiment, first))

@@ -208,8 +208,7 @@ def estimate_about(
                 end = search(fine, begin=begin)
                 density, residuals = end.density, end.residuals
                 creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
-                has_event = _has_event(residuals, creeps)
-                if not (has_event and settings.explains(np.where(creeps, 0.0, residuals))):
+                if settings.explains(residuals) and not _has_event(residuals, creeps):
                     break
             judged = items
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
