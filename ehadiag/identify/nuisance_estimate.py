@@ -402,13 +402,9 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if calibrated and any(slip_speed(item.constants) > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
-        if not found.explained and any(item.origin_read for item in experiments):
+        begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
+        if not found.explained and begins_as_read:
             found = self._from_origin(experiments, found, hint, before)
-        creeps = not found.explained and any(item.creeps for item in experiments)
-        if creeps and (calibrated or not found.confirmed) and _is_near(found.refined.residuals):
-            # What creeps leads a search, though it may end it in a wrong place.
-            with_creep = self._with(experiments, self.prior, hint, before, leave_creep_out=False)
-            found = _better_of(found, with_creep)
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
@@ -573,11 +569,8 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         before: float = float("inf"),
         further: tuple[Parameter, ...] = (),
         budget: int = NUISANCE_RUN_BUDGET,
-        *,
-        leave_creep_out: bool = True,
     ) -> NuisanceEstimate:
         settings, considered = self._search(experiments, prior, hint, before, further, budget)
-        settings = replace(settings, leave_creep_out=leave_creep_out)
         return estimate_nuisances(experiments, settings, considered)
 
     def _search(
@@ -605,5 +598,6 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             explains=prior.explains,
             require_agreement=any(item.test.closed_loop for item in experiments),
             excess_before=before,
+            leave_creep_out=True,
         )
         return settings, considered_parameters(experiments, free)

@@ -67,8 +67,8 @@ class RestartRules(msgspec.Struct, frozen=True):
     alias_half_span: float = 1.25
     """Half-width over which a parameter is moved against its alias, in units of its scale."""
     alias_points: int = 128
-    """Points on it, 1: a null bias 4 µA off, 0.8 steps of the spool's converter. With 16 the pressure
-    of a jack that sticks, which changes by 0.3 MPa from one of 128 to the next, was passed over."""
+    """Points on it where the spool is explained, 1: null biases 4 µA apart are spools 0.15 µm apart,
+    or 0.3 MPa on a jack that sticks; with 16 the place that explains the pressure was passed over."""
     closed_loop_share: float = 0.3
     """Spread about the best end in closed loop, in spreads of what open loop alone leaves."""
     closed_loop_budgets: int = 3
