@@ -205,6 +205,11 @@ def explains_spool(residuals: Array) -> bool:
     return signal_excess_costs(residuals)[SPOOL_ROW] <= FIT.max_explained_excess
 
 
+def is_near(residuals: Array) -> bool:
+    """Whether so little is left that it may be of break-aways at wrong ticks."""
+    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
+
+
 def misses_only_pressure(residuals: Array) -> bool:
     """Whether the spool is explained, and the pressure is not."""
     return explains_spool(residuals) and excess_cost(residuals) > FIT.max_explained_excess

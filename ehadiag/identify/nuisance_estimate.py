@@ -21,10 +21,10 @@ from ehadiag.identify.estimates import (
     explains_far_more,
     friction_by_exponent,
     independent_covariance,
+    is_near,
     is_pressure_misfit,
     is_unexplainable,
     likelihood_ratio_cost,
-    residual_outlier_share,
     signal_excess_costs,
 )
 from ehadiag.identify.experiment import (
@@ -145,11 +145,6 @@ def _searched(
     return [item.without_creep() for item in experiments]
 
 
-def _is_near(residuals: Array) -> bool:
-    """Whether so little is left that it may be of break-aways at wrong ticks."""
-    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
-
-
 def estimate_about(
     experiments: Sequence[Experiment],
     settings: NuisanceSearchSettings,
@@ -158,10 +153,12 @@ def estimate_about(
 ) -> NuisanceEstimate:
     """Estimate parameters about the end of a search, see `estimate_nuisances`."""
     model, found = staged.model, staged.found
+    judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
     if found.explained:
         offset = model.named(found.density.x)["spool_offset"]
         experiments = [item.with_origin(offset) for item in experiments]
-    judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
+        # Where the model follows the spool's sensor the search has explained it from there.
+        judged = [item if item.creep_end else item.with_origin(offset) for item in judged]
     held = [item.parameter for item in considered]
 
     def model_of(items: Sequence[Experiment]) -> Derivatives:
@@ -178,7 +175,7 @@ def estimate_about(
         item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
     )
     given_up = not found.explained and (
-        is_unexplainable(found.residuals, found.starts) or (alone and not _is_near(found.residuals))
+        is_unexplainable(found.residuals, found.starts) or (alone and not is_near(found.residuals))
     )
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])

@@ -21,6 +21,7 @@ from ehadiag.identify.estimates import (
     excess_cost,
     explains_far_more,
     explains_spool,
+    is_near,
     is_noise,
     is_unexplainable,
     misses_only_pressure,
@@ -67,7 +68,7 @@ class RestartRules(msgspec.Struct, frozen=True):
     alias_half_span: float = 1.25
     """Half-width over which a parameter is moved against its alias, in units of its scale."""
     alias_points: int = 128
-    """Points on it where the spool is explained, 1: null biases 4 µA apart are spools 0.15 µm apart,
+    """Points on it where little is left, 1: null biases 4 µA apart are spools 0.15 µm apart,
     or 0.3 MPa on a jack that sticks; with 16 the place that explains the pressure was passed over."""
     closed_loop_share: float = 0.3
     """Spread about the best end in closed loop, in spreads of what open loop alone leaves."""
@@ -190,7 +191,7 @@ def multistart_search(
             schedule=schedule, between=between,
         )  # fmt: skip
         end = _end_of(look(begin=begin), explains)
-        gains = looks_about and (best is None or explains_spool(end.residuals))
+        gains = looks_about and (best is None or is_near(end.residuals))
         while gains and not end.explained:
             near = _density_about_end(model, end, alias, restart_root)
             other = _end_of(look(begin=near), explains)
@@ -257,7 +258,7 @@ def _best_along_alias(model: Derivatives, best: MultistartResult, alias: str) ->
     if alias not in names:
         return x
     j = names.index(alias)
-    fine = explains_spool(best.residuals)
+    fine = is_near(best.residuals)
     half = (RESTARTS.alias_points if fine else RUN_BLOCK_SIZE) // 2
     shifts = RESTARTS.alias_half_span * (np.arange(2 * half) - half + 1.0) / half
     points = np.repeat(x[None, :], 2 * half, axis=0)
