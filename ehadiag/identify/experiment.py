@@ -159,8 +159,9 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
 
         Without a rest the control law follows the noise of the position until the command moves.
         Where the spool creeps up to its break-away by that, the tick is decided by as little as the
-        model errs, which hysteresis and a friction far off would explain. With oil in the second
-        stage nothing is left out: what rings on from then leads the search.
+        model errs, which hysteresis and a friction far off would explain; so the model follows the
+        spool's sensor until then. With oil in the second stage nothing is left out: what rings on
+        from then leads the search.
         """
         if not self.creeps:
             return self

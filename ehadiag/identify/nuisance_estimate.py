@@ -372,11 +372,6 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
-MAX_ORIGINS = 3
-"""Largest number of origins of the spool, 1, each less the offset that was found with the one
-before."""
-
-
 class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
@@ -420,15 +415,9 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         Where friction holds the spool the first break-away comes at another tick otherwise, and
         hysteresis stands in for friction.
         """
-        for _ in range(MAX_ORIGINS):
-            offset = found.refined.values["spool_offset"]
-            moved = [item.with_origin(offset) for item in experiments]
-            further = self._with(moved, self.prior, hint, before)
-            found = _better_of(found, further)
-            shift = further.refined.values["spool_offset"] - offset
-            if found.refined is not further.refined or abs(shift) < experiments[0].spool_noise:
-                break
-        return found
+        offset = found.refined.values["spool_offset"]
+        moved = [item.with_origin(offset) for item in experiments]
+        return _better_of(found, self._with(moved, self.prior, hint, before))
 
     def _loosened(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,
