@@ -192,7 +192,7 @@ def multistart_search(
         )  # fmt: skip
         end = _end_of(look(begin=begin), explains)
         gains = looks_about and (best is None or is_near(end.residuals))
-        while gains and not end.explained:
+        while gains and not end.explained and model.evaluations < until:
             near = _density_about_end(model, end, alias, restart_root)
             other = _end_of(look(begin=near), explains)
             left = excess_cost(other.residuals), excess_cost(end.residuals)
