@@ -142,7 +142,7 @@ def _searched(
     """Experiments as they are searched."""
     if not settings.leave_creep_out:
         return experiments
-    return [item.without_creep() for item in experiments]
+    return [item.without_creep(followed=settings.follow) for item in experiments]
 
 
 def estimate_about(
@@ -158,7 +158,7 @@ def estimate_about(
         offset = model.named(found.density.x)["spool_offset"]
         experiments = [item.with_origin(offset) for item in experiments]
         # Where the model follows the spool's sensor the search has explained it from there.
-        judged = [item if item.creep_end else item.with_origin(offset) for item in judged]
+        judged = [item if item.followed else item.with_origin(offset) for item in judged]
     held = [item.parameter for item in considered]
 
     def model_of(items: Sequence[Experiment]) -> Derivatives:
@@ -393,7 +393,13 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         calibrated = self.prior.joint is not None
         if calibrated and any(slip_speed(item.constants) > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
-        found = self._with(experiments, self.prior, hint, before)
+        creeps = [item.creeps for item in experiments]
+        # Most are explained by one start without following the sensor, which costs more looks.
+        budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
+        found = self._with(experiments, self.prior, hint, before, budget=budget)
+        if any(creeps) and not (found.explained or found.confirmed):
+            followed = self._with(experiments, self.prior, hint, before, follow=True)
+            found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
         if not found.explained and begins_as_read:
             found = self._from_origin(experiments, found, hint, before)
@@ -555,8 +561,11 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         before: float = float("inf"),
         further: tuple[Parameter, ...] = (),
         budget: int = NUISANCE_RUN_BUDGET,
+        *,
+        follow: bool = False,
     ) -> NuisanceEstimate:
         settings, considered = self._search(experiments, prior, hint, before, further, budget)
+        settings = replace(settings, follow=follow)
         return estimate_nuisances(experiments, settings, considered)
 
     def _search(

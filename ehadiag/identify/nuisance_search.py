@@ -192,7 +192,7 @@ def multistart_search(
         )  # fmt: skip
         end = _end_of(look(begin=begin), explains)
         gains = looks_about and (best is None or is_near(end.residuals))
-        while gains and not end.explained and model.evaluations < until:
+        while gains and not end.explained:
             near = _density_about_end(model, end, alias, restart_root)
             other = _end_of(look(begin=near), explains)
             left = excess_cost(other.residuals), excess_cost(end.residuals)
@@ -316,6 +316,8 @@ class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     leave_creep_out: bool = False
     """Whether to search without what comes before a closed loop's motion, and take it back where
     that is explained, too."""
+    follow: bool = False
+    """Whether the model follows the spool's sensor until then."""
 
     @property
     def frees_severities(self) -> bool:
