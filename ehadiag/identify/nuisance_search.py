@@ -264,7 +264,9 @@ def _best_along_alias(
     shifts = RESTARTS.alias_half_span * (2.0 * (np.arange(count) + 1.0) / count - 1.0)
     points = np.repeat(x[None, :], count, axis=0)
     points[:, j] = np.clip(x[j] + shifts, model.lower[j], model.upper[j])
-    _take_off_offsets(model, points, model.many(points))
+    nodes = points[:: count // RUN_BLOCK_SIZE]
+    _take_off_offsets(model, nodes, model.many(nodes))
+    points = np.column_stack([np.interp(points[:, j], nodes[:, j], row) for row in nodes.T])
     return points[int(np.argmin(cauchy_cost(model.many(points))))]
 
 
