@@ -74,7 +74,7 @@ class RestartRules(msgspec.Struct, frozen=True):
     """Spread about the best end in closed loop, in spreads of what open loop alone leaves."""
     closed_loop_budgets: int = 2
     """Budgets of a search in closed loop without open loop, 1: of 100 units with less than 0.5 % of
-    hysteresis (seed 99021) two needed a start begun after one, none after 1.3."""
+    hysteresis (seed 99021) one needed a start begun after one, none after 1.3."""
     coarse: float = 4.0
     """Objective over the number of samples beyond which a start may rest sooner, 1: four times the
     noise's cost. Broken hardware leaves more, and so does a start of a sound unit that went astray,
