@@ -200,13 +200,19 @@ def is_unexplainable(
     )
 
 
-def misses_only_pressure(residuals: Array) -> bool:
+def explains_spool(residuals: Array) -> bool:
     """Whether the spool is explained, so that break-aways come at the right ticks."""
-    excesses = signal_excess_costs(residuals)
-    return (
-        excesses[0] <= FIT.max_explained_excess
-        and max(excesses[1:], default=0.0) > FIT.max_explained_excess
-    )
+    return signal_excess_costs(residuals)[SPOOL_ROW] <= FIT.max_explained_excess
+
+
+def is_near(residuals: Array) -> bool:
+    """Whether so little is left that it may be of break-aways at wrong ticks."""
+    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
+
+
+def misses_only_pressure(residuals: Array) -> bool:
+    """Whether the spool is explained, and the pressure is not."""
+    return explains_spool(residuals) and excess_cost(residuals) > FIT.max_explained_excess
 
 
 def is_pressure_misfit(residuals: Array) -> bool:

@@ -118,6 +118,10 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
     """How the samples were measured separately; None: they are the computer's own."""
     sampled: Array = msgspec.field(default_factory=lambda: np.empty(0))
     """When the channels of `acquired` were sampled, s on its clock; empty without it."""
+    creep_end: int = 0
+    """Ticks in which what comes after a hold does not count."""
+    followed: bool = False
+    """Whether a model follows the spool's sensor until then."""
 
     @property
     def ticks(self) -> int:
@@ -151,23 +155,19 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         """Whether the noise of the position moves the spool before the command does."""
         return self.test.closed_loop and not self.rested and self.constants.OIL == 0.0
 
-    def without_creep(self) -> Experiment:
+    def without_creep(self, *, followed: bool = False) -> Experiment:
         """Return the same, in closed loop without what comes after a hold and before the motion.
 
         Without a rest the control law follows the noise of the position until the command moves.
         Where the spool creeps up to its break-away by that, the tick is decided by as little as the
         model errs, which hysteresis and a friction far off would explain. With oil in the second
-        stage nothing is left out: what rings on from then leads the search.
+        stage nothing is left out: what rings on from then leads the search. followed: whether the
+        model follows the spool's sensor until then: running free it may stick elsewhere.
         """
         if not self.creeps:
             return self
         end = _ticks_before_motion(self.test) + round(REST.creep_s * self.test.rate)
-        creeps = (np.arange(self.ticks) < end) & np.isfinite(self.pressure)
-        return replace(
-            self,
-            spool=np.where(creeps, np.nan, self.spool),
-            pressure=np.where(creeps, np.nan, self.pressure),
-        )
+        return replace(self, creep_end=end, followed=followed)
 
     def with_origin(self, offset: float) -> Experiment:
         """Return the same with the offset of the spool's sensor taken off an origin read by it."""
@@ -511,7 +511,9 @@ def lay_out_spans(
     weight, anchors, origins, places = [], [], [], []
     for index, first, a, b in parts:
         experiment = experiments[index]
-        inside = np.arange(first, b) >= a
+        ticks = np.arange(first, b)
+        held = np.isnan(experiment.pressure[first:b])
+        inside = (ticks >= a) & ((ticks >= experiment.creep_end) | held)
         on_spool = inside & np.isfinite(experiment.spool[first:b]) & channels[0]
         on_pressure = inside & np.isfinite(experiment.pressure[first:b]) & channels[1]
         rows = [on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise]
@@ -521,7 +523,12 @@ def lay_out_spans(
             )
             rows.append(on_position / experiment.position_noise)
         weight.append(np.vstack(rows))
-        anchor = NO_ANCHOR if anchor_lsb is None else experiment.anchor(anchor_lsb)
+        anchor = NO_ANCHOR
+        if anchor_lsb is not None:
+            anchor = experiment.anchor(anchor_lsb)
+        elif experiment.followed and experiment.creep_end > first:
+            follows = experiment.anchor(ANCHOR_THRESHOLDS_LSB)
+            anchor = replace(follows, follow=0.0, until=experiment.creep_end - first)
         anchors.append(anchor.as_array())
         origins.append(_origin(experiment, first))
         places.append(_place(experiment, first))

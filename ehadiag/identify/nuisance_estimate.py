@@ -21,10 +21,10 @@ from ehadiag.identify.estimates import (
     explains_far_more,
     friction_by_exponent,
     independent_covariance,
+    is_near,
     is_pressure_misfit,
     is_unexplainable,
     likelihood_ratio_cost,
-    residual_outlier_share,
     signal_excess_costs,
 )
 from ehadiag.identify.experiment import (
@@ -142,12 +142,7 @@ def _searched(
     """Experiments as they are searched."""
     if not settings.leave_creep_out:
         return experiments
-    return [item.without_creep() for item in experiments]
-
-
-def _is_near(residuals: Array) -> bool:
-    """Whether so little is left that it may be of break-aways at wrong ticks."""
-    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
+    return [item.without_creep(followed=settings.follow) for item in experiments]
 
 
 def estimate_about(
@@ -158,10 +153,12 @@ def estimate_about(
 ) -> NuisanceEstimate:
     """Estimate parameters about the end of a search, see `estimate_nuisances`."""
     model, found = staged.model, staged.found
+    judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
     if found.explained:
         offset = model.named(found.density.x)["spool_offset"]
         experiments = [item.with_origin(offset) for item in experiments]
-    judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
+        # Where the model follows the spool's sensor the search has explained it from there.
+        judged = [item if item.followed else item.with_origin(offset) for item in judged]
     held = [item.parameter for item in considered]
 
     def model_of(items: Sequence[Experiment]) -> Derivatives:
@@ -178,7 +175,7 @@ def estimate_about(
         item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
     )
     given_up = not found.explained and (
-        is_unexplainable(found.residuals, found.starts) or (alone and not _is_near(found.residuals))
+        is_unexplainable(found.residuals, found.starts) or (alone and not is_near(found.residuals))
     )
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
@@ -208,8 +205,7 @@ def estimate_about(
                 end = search(fine, begin=begin)
                 density, residuals = end.density, end.residuals
                 creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
-                has_event = _has_event(residuals, creeps)
-                if not (has_event and settings.explains(np.where(creeps, 0.0, residuals))):
+                if settings.explains(residuals) and not _has_event(residuals, creeps):
                     break
             judged = items
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
@@ -376,11 +372,6 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
-MAX_ORIGINS = 3
-"""Largest number of origins of the spool, 1, each less the offset that was found with the one
-before."""
-
-
 class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
@@ -402,14 +393,16 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         calibrated = self.prior.joint is not None
         if calibrated and any(slip_speed(item.constants) > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
-        found = self._with(experiments, self.prior, hint, before)
-        if not found.explained and any(item.origin_read for item in experiments):
+        creeps = [item.creeps for item in experiments]
+        # Most are explained by one start without following the sensor, which costs more looks.
+        budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
+        found = self._with(experiments, self.prior, hint, before, budget=budget)
+        if any(creeps) and not (found.explained or found.confirmed):
+            followed = self._with(experiments, self.prior, hint, before, follow=True)
+            found = _better_of(found, followed)
+        begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
+        if not found.explained and begins_as_read:
             found = self._from_origin(experiments, found, hint, before)
-        creeps = not found.explained and any(item.creeps for item in experiments)
-        if creeps and (calibrated or not found.confirmed) and _is_near(found.refined.residuals):
-            # What creeps leads a search, though it may end it in a wrong place.
-            with_creep = self._with(experiments, self.prior, hint, before, leave_creep_out=False)
-            found = _better_of(found, with_creep)
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
@@ -428,15 +421,9 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         Where friction holds the spool the first break-away comes at another tick otherwise, and
         hysteresis stands in for friction.
         """
-        for _ in range(MAX_ORIGINS):
-            offset = found.refined.values["spool_offset"]
-            moved = [item.with_origin(offset) for item in experiments]
-            further = self._with(moved, self.prior, hint, before)
-            found = _better_of(found, further)
-            shift = further.refined.values["spool_offset"] - offset
-            if found.refined is not further.refined or abs(shift) < experiments[0].spool_noise:
-                break
-        return found
+        offset = found.refined.values["spool_offset"]
+        moved = [item.with_origin(offset) for item in experiments]
+        return _better_of(found, self._with(moved, self.prior, hint, before))
 
     def _loosened(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,
@@ -575,10 +562,10 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         further: tuple[Parameter, ...] = (),
         budget: int = NUISANCE_RUN_BUDGET,
         *,
-        leave_creep_out: bool = True,
+        follow: bool = False,
     ) -> NuisanceEstimate:
         settings, considered = self._search(experiments, prior, hint, before, further, budget)
-        settings = replace(settings, leave_creep_out=leave_creep_out)
+        settings = replace(settings, follow=follow)
         return estimate_nuisances(experiments, settings, considered)
 
     def _search(
@@ -606,5 +593,6 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             explains=prior.explains,
             require_agreement=any(item.test.closed_loop for item in experiments),
             excess_before=before,
+            leave_creep_out=True,
         )
         return settings, considered_parameters(experiments, free)

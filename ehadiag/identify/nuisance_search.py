@@ -20,6 +20,8 @@ from ehadiag.identify.estimates import (
     ExplanationTest,
     excess_cost,
     explains_far_more,
+    explains_spool,
+    is_near,
     is_noise,
     is_unexplainable,
     misses_only_pressure,
@@ -65,11 +67,14 @@ class RestartRules(msgspec.Struct, frozen=True):
     recorded."""
     alias_half_span: float = 1.25
     """Half-width over which a parameter is moved against its alias, in units of its scale."""
+    alias_points: int = 128
+    """Points on it where little is left, 1: null biases 4 µA apart are spools 0.15 µm apart, or
+    0.3 MPa on a jack that sticks; with 16 what explains the pressure was passed over."""
     closed_loop_share: float = 0.3
     """Spread about the best end in closed loop, in spreads of what open loop alone leaves."""
-    closed_loop_budgets: int = 3
-    """Budgets of a search in closed loop without open loop, 1: ten of 300 units were given up with
-    one, one with two, none with three."""
+    closed_loop_budgets: int = 2
+    """Budgets of a search in closed loop without open loop, 1: of 100 units with less than 0.5 % of
+    hysteresis (seed 99021) one needed a start begun after one, none after 1.3."""
     coarse: float = 4.0
     """Objective over the number of samples beyond which a start may rest sooner, 1: four times the
     noise's cost. Broken hardware leaves more, and so does a start of a sound unit that went astray,
@@ -153,11 +158,11 @@ def multistart_search(
     it raises ends the search; gives_up: whether further starts will not help, by the best residuals
     and the number of starts; require_agreement: whether all starts but the first are slow and from
     the last origin, until enough have ended at the same point; else every other start is near the
-    best end so far; looks_about: whether the first start looks again about its end as long as that
-    gains; confirms: whether an end that misses only the pressure ends the search, too, where a
-    second start agrees or the excess is that of `excess_before`; excess_before: excess of another
-    search with fewer unknowns; coarse: see `SearchSchedule`. Returns best end, and those of all
-    starts.
+    best end so far; looks_about: whether the first start, and each that leaves little, looks again
+    about its end as long as that gains; confirms: whether an end that misses only the pressure ends
+    the search, too, where a second start agrees or the excess is that of `excess_before`;
+    excess_before: excess of another search with fewer unknowns; coarse: see `SearchSchedule`.
+    Returns best end, and those of all starts.
     """
     until = model.evaluations + budget
     restart_root = RESTARTS.spread_share * prior.root if restart_root is None else restart_root
@@ -186,7 +191,7 @@ def multistart_search(
             schedule=schedule, between=between,
         )  # fmt: skip
         end = _end_of(look(begin=begin), explains)
-        gains = looks_about and best is None
+        gains = looks_about and (best is None or is_near(end.residuals))
         while gains and not end.explained:
             near = _density_about_end(model, end, alias, restart_root)
             other = _end_of(look(begin=near), explains)
@@ -221,11 +226,12 @@ def _density_about_end(
     near that of the end. root: of the covariance where more than that is wrong.
     """
     names = [model.estimated[j].name for j in model.curved]
-    if alias in names and misses_only_pressure(end.residuals):
+    if alias in names and explains_spool(end.residuals):
         root, place = RESTARTS.end_spread * end.density.root, names.index(alias)
         root[place], root[:, place] = 0.0, 0.0
-        root[place, place] = RESTARTS.alias_half_span / (0.5 * RUN_BLOCK_SIZE)
-    return ParameterDensity(_best_along_alias(model, end, alias), root)
+        root[place, place] = 2.0 * RESTARTS.alias_half_span / RESTARTS.alias_points
+    points = RESTARTS.alias_points if is_near(end.residuals) else RUN_BLOCK_SIZE
+    return ParameterDensity(_best_along_alias(model, end, alias, points), root)
 
 
 def _is_confirmed(best: MultistartResult, places: Sequence[StartEnd], excess_before: float) -> bool:
@@ -246,21 +252,21 @@ def _ends_agree(best: MultistartResult, places: Sequence[StartEnd]) -> bool:
     return sum(place.cost - best.cost <= GIVE_UP.same_end_cost * unit for place in places) >= enough
 
 
-def _best_along_alias(model: Derivatives, best: MultistartResult, alias: str) -> Array:
-    """Best point along the line on which a parameter and a sensor's constant error trade."""
+def _best_along_alias(
+    model: Derivatives, best: MultistartResult, alias: str, count: int = RUN_BLOCK_SIZE
+) -> Array:
+    """Best point of a line on which a parameter and a sensor's constant error trade."""
     names = [item.name for item in model.estimated]
     x = best.density.x
     if alias not in names:
         return x
     j = names.index(alias)
-    shifts = (
-        RESTARTS.alias_half_span
-        * (np.arange(RUN_BLOCK_SIZE) - 0.5 * RUN_BLOCK_SIZE + 1.0)
-        / (0.5 * RUN_BLOCK_SIZE)
-    )
-    points = np.repeat(x[None, :], RUN_BLOCK_SIZE, axis=0)
+    shifts = RESTARTS.alias_half_span * (2.0 * (np.arange(count) + 1.0) / count - 1.0)
+    points = np.repeat(x[None, :], count, axis=0)
     points[:, j] = np.clip(x[j] + shifts, model.lower[j], model.upper[j])
-    _take_off_offsets(model, points, model.many(points))
+    nodes = points[:: count // RUN_BLOCK_SIZE]
+    _take_off_offsets(model, nodes, model.many(nodes))
+    points = np.column_stack([np.interp(points[:, j], nodes[:, j], row) for row in nodes.T])
     return points[int(np.argmin(cauchy_cost(model.many(points))))]
 
 
@@ -311,7 +317,9 @@ class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     """See `multistart_search`."""
     leave_creep_out: bool = False
     """Whether to search without what comes before a closed loop's motion, and take it back where
-    that leaves no break-away at a wrong tick."""
+    that is explained, too."""
+    follow: bool = False
+    """Whether the model follows the spool's sensor until then."""
 
     @property
     def frees_severities(self) -> bool:

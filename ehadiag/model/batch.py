@@ -33,10 +33,12 @@ class Anchor(msgspec.Struct, frozen=True):
     """Innovation of one sample that moves it, m."""
     follow: float = 0.0
     """Share of the jack's innovation by which it is moved, 0 … 1; where its position counts."""
+    until: float = np.inf
+    """Ticks of a span after which the spool runs free."""
 
     def as_array(self) -> Array:
         """The form that kernels take."""
-        return np.array([self.gain, self.small, self.large, self.follow])
+        return np.array([self.gain, self.small, self.large, self.follow, self.until])
 
 
 NO_ANCHOR = Anchor(0.0, np.inf, np.inf)
@@ -80,4 +82,4 @@ class Batch(NamedTuple):
     """Reciprocal noise of spool and pressure, and of the position if it counts; 0 where not used;
     shape (signals, N)."""
     anchor: Array2
-    """Re-anchoring in each span, see `ehadiag.model.batch.Anchor`; shape (m, 4)."""
+    """Re-anchoring in each span, see `ehadiag.model.batch.Anchor`; shape (m, 5)."""

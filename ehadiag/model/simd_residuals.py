@@ -125,7 +125,7 @@ def _block(
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
         tick, test = batch.tick[index], batch.test[index]
-        gain, small, large, follow = batch.anchor[index]
+        gain, small, large, follow, until = batch.anchor[index]
         anchored = math.isfinite(small) or math.isfinite(large)
         if index == 0 or test != batch.test[index - 1] or tick != batch.tick[index - 1]:
             for i in range(LANES):
@@ -178,7 +178,7 @@ def _block(
                         out[i, POSITION_ROW, k] = sample[i]
                 if follow != 0.0:
                     anchor_jack_lanes(end, position[k], follow, state, coefficients)
-            if anchored and seen:
+            if anchored and seen and k - start[index] < until:
                 anchor_spool_lanes(end, read, spool[k], gain, small, large, state, coefficients)
 
 
