@@ -239,7 +239,7 @@ def test_a_flapper_that_does_not_ring():
 def test_residuals_and_anchors_are_those_of_one_alone(recorded_model, population):
     batch = recorded_model.batch
     noise = 1.0 / batch.weight[0].max()
-    anchored = batch._replace(anchor=np.array([[0.1, 3.0 * noise, 12.0 * noise, 0.0]]))
+    anchored = batch._replace(anchor=Anchor(0.1, 3.0 * noise, 12.0 * noise).as_array()[None])
     points = np.zeros((18, len(FAULTS) + 1))
     points[:, :3] = population[-18:]
     points[:, 3] = np.linspace(-1e-6, 1e-6, 18)
@@ -262,7 +262,7 @@ CUBE = st.tuples(*[st.floats(0.0, 1.0)] * 3)
 @given(one=CUBE, others=st.lists(CUBE, min_size=1, max_size=LANES + 2), place=st.integers(0, 99))
 def test_no_lane_depends_on_its_neighbours(one, others, place):
     batch = own_batch((0.3, 0.3, 0.3), SHORT)
-    model = SimdModel(batch._replace(anchor=np.array([[0.1, 1e-6, 4e-6, 0.0]])), space())
+    model = SimdModel(batch._replace(anchor=Anchor(0.1, 1e-6, 4e-6).as_array()[None]), space())
     place %= len(others) + 1
     together, counts = model.residuals(np.array([*others[:place], one, *others[place:]]))
     alone, count = model.residuals(np.array([one]))
