@@ -54,6 +54,17 @@ def _radau_table() -> RadauTable:
 RADAU = _radau_table()
 
 
+class RadauMinors(NamedTuple):
+    """Minors of the table's weights that belong to its third column, 1."""
+
+    c1: float = RADAU.a21 * RADAU.a32 - RADAU.a22 * RADAU.a31
+    c2: float = RADAU.a12 * RADAU.a31 - RADAU.a11 * RADAU.a32
+    c3: float = RADAU.a11 * RADAU.a22 - RADAU.a12 * RADAU.a21
+
+
+RADAU_MINORS = RadauMinors()
+
+
 @packed
 def _stage_pressures(
     j: JackLaw, h: Any, load: Any, velocity: Any,
@@ -145,8 +156,24 @@ def radau_velocity(
     load: external and dynamic friction force at its start, N; x1, x2, x3: spool at the three
     stages, m; e1, e2, e3: `stage_resistance` there. Numbers or vectors of them.
     """
-    p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)[2]
-    return j.flow * x3 - e3 * p3
+    k = h * j.by_mass
+    thrust, drag = k * j.area, k * j.viscosity
+    f1, f2, f3 = thrust + drag * e1, thrust + drag * e2, thrust + drag * e3
+    # Cramer's rule for the third pressure alone; the state comes last, so that steps that follow
+    # one another overlap in the processor.
+    c1 = f1 * (RADAU_MINORS.c1 * f2 - RADAU.a31 * e2)
+    c2 = f2 * (RADAU_MINORS.c2 * f1 - RADAU.a32 * e1)
+    c3 = e1 * (e2 + RADAU.a22 * f2) + f1 * (RADAU.a11 * e2 + RADAU_MINORS.c3 * f2)
+    t1 = RADAU.a11 * c1 + RADAU.a21 * c2 + RADAU.a31 * c3
+    t2 = RADAU.a12 * c1 + RADAU.a22 * c2 + RADAU.a32 * c3
+    t3 = RADAU.a13 * c1 + RADAU.a23 * c2 + RADAU.a33 * c3
+    share = e3 / (e3 * c3 + f3 * t3)
+    driven = c1 * x1 + c2 * x2 + c3 * x3 + drag * (t1 * x1 + t2 * x2 + t3 * x3)
+    more = 0.5 * h * k * j.spring
+    by_velocity = c1 + c2 + c3
+    by_velocity = by_velocity - more * (RADAU.c1 * RADAU.c1 * c1 + RADAU.c2 * RADAU.c2 * c2 + c3)
+    by_load = share * k * (RADAU.c1 * c1 + RADAU.c2 * c2 + c3)
+    return j.flow * (x3 - share * driven) + share * by_velocity * velocity - by_load * load
 
 
 MAX_INSTANT_SHARE = 1.0 + 1e-6

@@ -55,7 +55,12 @@ from ehadiag.model.sensors import (
     read_pressure,
     sensor_law,
 )
-from ehadiag.model.simd_jack_pieces import jack_events, jack_over_pieces, orifice_events
+from ehadiag.model.simd_jack_pieces import (
+    jack_events,
+    jack_over_pieces,
+    linear_step_events,
+    orifice_events,
+)
 from ehadiag.model.simd_layout import (
     BLOCK,
     COEFFICIENTS,
@@ -118,6 +123,8 @@ def _stages() -> Array:
 
 
 STAGE_TABLE = _stages()
+NODE_HALVINGS = 2
+"""Halvings of a tick up to which its steps end at nodes of the path, 1."""
 
 
 class StagePlaces(NamedTuple):
@@ -137,13 +144,19 @@ STAGES = StagePlaces()
 
 
 @packed
+def _stage(k: int) -> float:
+    """Number `k` of the table of stages, without a check for places from its end."""
+    return STAGE_TABLE[np.uint64(k)]
+
+
+@packed
 def stage_position(path: Array, o: int, k: int, tick: float) -> Vector:
     """Spool at the stage whose place in STAGES is `k`, lanes from `o`."""
-    a = int(STAGE_TABLE[k]) * LANES + o
+    a = int(_stage(k)) * LANES + o
     b = a + LANES
-    slopes = load(path, LANE_PATH_SLOPE * LANES + a) * STAGE_TABLE[k + 3]
-    slopes = slopes + load(path, LANE_PATH_SLOPE * LANES + b) * STAGE_TABLE[k + 4]
-    return STAGE_TABLE[k + 1] * load(path, a) + STAGE_TABLE[k + 2] * load(path, b) + tick * slopes
+    slopes = load(path, LANE_PATH_SLOPE * LANES + a) * _stage(k + 3)
+    slopes = slopes + load(path, LANE_PATH_SLOPE * LANES + b) * _stage(k + 4)
+    return _stage(k + 1) * load(path, a) + _stage(k + 2) * load(path, b) + tick * slopes
 
 
 @packed
@@ -196,103 +209,132 @@ def filter_pressure(
     store(state, ROWS.pressure_lagged * LANES + o, where(these, at_end, before))
 
 
-def _jack_lane_step(senses: bool) -> Any:
-    """Compiled step of the jack of all lanes, with or without the sensor of pressure."""
+def _jack_tick(senses: bool) -> Any:
+    """Compiled tick of the jack of all lanes, with or without the sensor of pressure."""
 
     @packed
-    def lanes(
-        end: int, level: int, step: int, tick: float, state: Array, path: Array, coefficients: Array
-    ) -> bool:
-        any_busy = False
+    def ticks(
+        count: int, end: int, tick: float, level: int, state: Array, path: Array,
+        coefficients: Array,
+    ) -> None:  # fmt: skip
         h = tick / (1 << level)
-        k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
         for o in range(0, end, VECTOR_WIDTH):
             j = jack_laws(coefficients, o)
             place, velocity = (
                 load(state, ROWS.jack * LANES + o),
                 load(state, ROWS.jack_velocity * LANES + o),
             )
-            d = load(state, ROWS.jack_direction * LANES + o)
-            x3 = stage_position(path, o, k + STAGES.end, tick)
-            e3 = stage_resistance(j, x3)
-            # At rest: the force of the second stage, times e, against what holds.
-            force = j.load + j.spring * place
-            push = j.area * j.flow * x3 - force * e3
-            held = absolute(push) <= j.static * e3
-            held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
+            d, fresh = (
+                load(state, ROWS.jack_direction * LANES + o),
+                load(state, ROWS.fresh * LANES + o),
+            )
             done = load(state, ROWS.done * LANES + o) != 0.0
-            rests = (d == 0.0) & held & ~done
-            fine = done | rests
-            if senses and any_lane(rests):
-                x0, x1, x2 = (
-                    stage_position(path, o, k + STAGES.start, tick),
-                    stage_position(path, o, k, tick),
-                    stage_position(path, o, k + 5, tick),
-                )
-                _sense(
-                    j, rests, level, step, o,
-                    stage_pressure(j, x0, 0.0), stage_pressure(j, x1, 0.0), stage_pressure(j, x2,
-                    0.0),
-                    stage_pressure(j, x3, 0.0), state, coefficients,
-                )  # fmt: skip
-            if any_lane(d != 0.0):
-                creeps = senses and any_lane(j.extra > 0.0)
-                x1 = stage_position(path, o, k, tick)
-                x2 = stage_position(path, o, k + 5, tick)
-                e1, e2, pull = (
-                    stage_resistance(j, x1),
-                    stage_resistance(j, x2),
-                    force + d * j.friction,
-                )
-                if senses:
-                    if creeps:
-                        p1, p2, p3 = radau_creep_pressures(
-                            j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
-                        )
-                    else:
-                        p1, p2, p3 = radau_pressures(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
-                    later = j.flow * x3 - e3 * p3
+            # From step to step in registers: what is stored in part cannot be loaded at once.
+            for step in range(1 << level):
+                k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
+                if level <= NODE_HALVINGS:  # it ends at a node
+                    x3 = load(path, ((step + 1) * (LANE_NODES >> level)) * LANES + o)
                 else:
+                    x3 = stage_position(path, o, k + STAGES.end, tick)
+                e3 = stage_resistance(j, x3)
+                force = j.load + j.spring * place
+                rests, moves = (d == 0.0) & ~done, (d != 0.0) & ~done
+                if any_lane(rests):
+                    # The force of the second stage, times e, against what holds.
+                    push = j.area * j.flow * x3 - force * e3
+                    held = absolute(push) <= j.static * e3
+                    held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
+                    rests = rests & held
+                fine, place0, velocity0 = done | rests, place, velocity
+                if senses and any_lane(rests):
+                    x0, x1, x2 = (
+                        stage_position(path, o, k + STAGES.start, tick),
+                        stage_position(path, o, k, tick),
+                        stage_position(path, o, k + 5, tick),
+                    )
+                    _sense(
+                        j, rests, level, step, o,
+                        stage_pressure(j, x0, 0.0), stage_pressure(j, x1, 0.0),
+                        stage_pressure(j, x2, 0.0), stage_pressure(j, x3, 0.0),
+                        state, coefficients,
+                    )  # fmt: skip
+                if any_lane(moves):
+                    creeps = senses and any_lane(j.extra > 0.0)
+                    x1 = stage_position(path, o, k, tick)
+                    x2 = stage_position(path, o, k + 5, tick)
+                    e1, e2, pull = (
+                        stage_resistance(j, x1),
+                        stage_resistance(j, x2),
+                        force + d * j.friction,
+                    )
                     later = radau_velocity(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
-                moved = place + 0.5 * h * (velocity + later)
-                slides = (later * d > 0.0) & (absolute(moved) < j.stroke)
-                # What the collocation does not follow: a fresh start, a fast way past the closed
-                # orifice.
-                near = where(x1 * x3 > 0.0, minimum(absolute(x1), absolute(x3)), 0.0)
-                travel = absolute(x3 - x1)
-                coarse = travel > maximum(near, LANE_STEPS.travel)
-                coarse = coarse | (
-                    (near < j.corner)
-                    & (maximum(effective_opening(j, x1), effective_opening(j, x3)) > j.corner)
-                    & (travel > LANE_STEPS.corner_travel)
-                )
-                if creeps:
-                    fade = j.flow * j.by_stribeck
+                    if senses:
+                        p1, p2, p3 = radau_pressures(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
+                        if creeps:
+                            p1, p2, p3 = radau_creep_pressures(
+                                j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
+                            )
+                            later = where(j.extra > 0.0, j.flow * x3 - e3 * p3, later)
+                    moved = place + 0.5 * h * (velocity + later)
+                    slides = (later * d > 0.0) & (absolute(moved) < j.stroke)
+                    # What the collocation does not follow: a fresh start, a fast way past the
+                    # closed orifice.
+                    near = where(x1 * x3 > 0.0, minimum(absolute(x1), absolute(x3)), 0.0)
+                    travel = absolute(x3 - x1)
+                    coarse = travel > maximum(near, LANE_STEPS.travel)
                     coarse = coarse | (
-                        (near * fade < JACK_STEPS.creep_limit) & (travel * fade > JACK_STEPS.fade)
+                        (near < j.corner)
+                        & (maximum(effective_opening(j, x1), effective_opening(j, x3)) > j.corner)
+                        & (travel > LANE_STEPS.corner_travel)
                     )
-                slides = slides & ~coarse & (load(state, ROWS.fresh * LANES + o) == 0.0)
-                slides = slides & ~done
-                store(state, ROWS.jack * LANES + o, where(slides, moved, place))
-                store(state, ROWS.jack_velocity * LANES + o, where(slides, later, velocity))
-                fine = fine | slides
-                if senses and any_lane(slides):
-                    p0 = stage_pressure(
-                        j, stage_position(path, o, k + STAGES.start, tick), velocity
+                    if creeps:
+                        fade = j.flow * j.by_stribeck
+                        coarse = coarse | (
+                            (near * fade < JACK_STEPS.creep_limit)
+                            & (travel * fade > JACK_STEPS.fade)
+                        )
+                    slides = slides & ~coarse & (fresh == 0.0) & moves
+                    if senses and any_lane(slides):
+                        p0 = stage_pressure(
+                            j, stage_position(path, o, k + STAGES.start, tick), velocity
+                        )
+                        _sense(j, slides, level, step, o, p0, p1, p2, p3, state, coefficients)
+                    fine = fine | slides
+                    # Whether it slides need not be known before the next step begins.
+                    place, velocity = where(moves, moved, place), where(moves, later, velocity)
+                if any_lane(~fine):
+                    place, velocity = where(fine, place, place0), where(fine, velocity, velocity0)
+                    store(state, ROWS.jack * LANES + o, place)
+                    store(state, ROWS.jack_velocity * LANES + o, velocity)
+                    events = ~fine
+                    if senses:
+                        law = sensor_laws(coefficients, o)
+                        plain = (law.lag + law.lead == 0.0) & (j.extra == 0.0)
+                        alone = events & ~plain
+                        if any_lane(alone):
+                            store(state, ROWS.busy * LANES + o, where(alone, 1.0, 0.0))
+                            last = min(o + VECTOR_WIDTH, count)
+                            jack_events(o, last, level, step, tick, state, path, coefficients)
+                        events = events & plain
+                    if any_lane(events):
+                        linear_step_events(o, level, step, tick, events, state, path, coefficients)
+                    place, velocity = (
+                        load(state, ROWS.jack * LANES + o),
+                        load(state, ROWS.jack_velocity * LANES + o),
                     )
-                    _sense(j, slides, level, step, o, p0, p1, p2, p3, state, coefficients)
-            store(state, ROWS.busy * LANES + o, where(fine, 0.0, 1.0))
-            if any_lane(~fine):
-                any_busy = True
-        return any_busy
+                    d, fresh = (
+                        load(state, ROWS.jack_direction * LANES + o),
+                        load(state, ROWS.fresh * LANES + o),
+                    )
+            store(state, ROWS.jack * LANES + o, place)
+            store(state, ROWS.jack_velocity * LANES + o, velocity)
 
-    return lanes
+    return ticks
 
 
-jack_lanes, sensed_jack_lanes = _jack_lane_step(False), _jack_lane_step(True)
-"""Compiled: jack of the lanes before `end` over one of the 2^level steps of a tick; with the second
-one their pressure as the filter before its converter has it. Lanes with an event are marked busy
-and left as they were; returns whether there are any."""
+jack_tick, sensed_jack_tick = _jack_tick(False), _jack_tick(True)
+"""Compiled: jack of all lanes over a tick cut into 2^level steps; with the second one their
+pressure as the filter before its converter has it. A lane with an event takes its step alone."""
 
 
 @packed
@@ -463,7 +505,7 @@ def _ticks(senses: bool) -> Any:
     ) -> None:
         for step in range(1 << level):
             if lanes(end, level, step, tick, state, path, coefficients, later):
-                jack_events(count, level, step, tick, state, path, coefficients)
+                jack_events(0, count, level, step, tick, state, path, coefficients)
 
     return ticks
 

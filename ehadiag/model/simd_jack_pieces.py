@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined
 from ehadiag.compile.vector import (
@@ -84,16 +85,17 @@ def keep_lane_jack(jack: JackState, state: Array, i: int) -> None:
 
 @bare_kernel
 def jack_events(
-    count: int, level: int, step: int, tick: float, state: Array, path: Array, coefficients: Array
-) -> None:
-    """Jack of busy lanes, of the first `count`, over one of the 2^level steps of a tick.
+    begin_lane: int, end_lane: int, level: int, step: int, tick: float,
+    state: Array, path: Array, coefficients: Array,
+) -> None:  # fmt: skip
+    """Jack of busy lanes, each alone, over one of the 2^level steps of a tick, piece by piece.
 
-    Piece by piece of the spool's path.
+    begin_lane, end_lane: the first of them, and the one behind the last.
     """
     span, steps = tick / LANE_NODES, 1 << level
     begin, stop = step * LANE_NODES / steps, (step + 1) * LANE_NODES / steps
     first, last = int(begin), math.ceil(stop)
-    for i in range(count):
+    for i in range(begin_lane, end_lane):
         if state[ROWS.busy * LANES + i] == 0.0:
             continue
         j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
@@ -113,25 +115,70 @@ def jack_events(
         keep_lane_jack(jack, state, i)
 
 
+@packed
+def linear_step_events(
+    o: int, level: int, step: int, tick: float, these: Mask,
+    state: Array, path: Array, coefficients: Array,
+) -> None:  # fmt: skip
+    """Jack of these lanes from `o` over one of the 2^level steps of a tick, piece by piece."""
+    steps = 1 << level
+    begin, stop = step * LANE_NODES / steps, (step + 1) * LANE_NODES / steps
+    for n in range(int(begin), math.ceil(stop)):
+        span, a = tick / LANE_NODES, n * LANES + o
+        slope = LANE_PATH_SLOPE * LANES + a
+        linear_events(
+            o, where(these, 1.0, 0.0), load(path, a) * 0.0 + span,
+            load(path, a), load(path, a + LANES),
+            span * load(path, slope), span * load(path, slope + LANES),
+            max(begin - n, 0.0), min(stop - n, 1.0), state, coefficients,
+        )  # fmt: skip
+
+
+class _Bracket(NamedTuple):
+    """Shares of a piece about a root, and what falls through 0 there: positive at `low`."""
+
+    low: Vector
+    high: Vector
+    at_low: Vector
+    at_high: Vector
+    side: Vector
+    """Of the last share that was tried: 1 before the root, -1 behind, 0 at first."""
+
+
+@packed
+def _secant_share(b: _Bracket) -> Vector:
+    """Share to try next."""
+    drop = minimum(b.at_high - b.at_low, -JACK_STEPS.least_rate)
+    return b.high - (b.high - b.low) * b.at_high / drop
+
+
+@packed
+def _narrowed(b: _Bracket, q: Vector, value: Vector) -> _Bracket:
+    """The bracket less what is beyond a share (regula falsi, Illinois)."""
+    before = value > 0.0
+    return _Bracket(
+        where(before, q, b.low),
+        where(before, b.high, q),
+        where(before, value, where(b.side < 0.0, 0.5 * b.at_low, b.at_low)),
+        where(before, where(b.side > 0.0, 0.5 * b.at_high, b.at_high), value),
+        where(before, 1.0, -1.0),
+    )
+
+
 CROSSING_ROUNDS = 10
 """Rounds for the root of a cubic, 1: from each side to 1e-9 of a step."""
 
 
 @packed
 def _crossing(g0: Vector, g1: Vector, s0: Vector, s1: Vector) -> Vector:
-    """Share of a step at which a cubic with ends g0 > 0 >= g1 and slopes s0, s1 is 0 (Illinois)."""
-    low, high, at_low, at_high, side = g0 * 0.0, g0 * 0.0 + 1.0, g0, g1, g0 * 0.0
+    """Share of a step at which a cubic with ends g0 > 0 >= g1 and slopes s0, s1 is 0."""
+    b = _Bracket(g0 * 0.0, g0 * 0.0 + 1.0, g0, g1, g0 * 0.0)
     for _ in range(CROSSING_ROUNDS):
-        drop = minimum(at_high - at_low, -JACK_STEPS.least_rate)
-        q = high - (high - low) * at_high / drop
+        q = _secant_share(b)
         r = 1.0 - q
         value = g0 + q * q * (3.0 - 2.0 * q) * (g1 - g0) + q * r * (r * s0 - q * s1)
-        before = value > 0.0
-        at_high = where(before, where(side > 0.0, 0.5 * at_high, at_high), value)
-        at_low = where(before, value, where(side < 0.0, 0.5 * at_low, at_low))
-        low, high = where(before, q, low), where(before, high, q)
-        side = where(before, 1.0, -1.0)
-    return high
+        b = _narrowed(b, q, value)
+    return b.high
 
 
 @large_packed
@@ -222,6 +269,136 @@ def orifice_events(
     store_where(state, ROWS.pressure * LANES + o, mine, p12)
 
 
+@packed
+def _radau_to(
+    j: JackLaw, p: PathPiece, load: Vector, velocity: Vector, begin: Vector, end: Vector
+) -> Vector:
+    """Velocity of the moving jacks at the share `end` of a piece, `velocity` at `begin`, m/s."""
+    step = end - begin
+    x1 = position_on_piece(p, begin + RADAU.c1 * step)
+    x2 = position_on_piece(p, begin + RADAU.c2 * step)
+    x3 = position_on_piece(p, end)
+    return radau_velocity(
+        j, step * p.span, load, velocity, x1, x2, x3,
+        stage_resistance(j, x1), stage_resistance(j, x2), stage_resistance(j, x3),
+    )  # fmt: skip
+
+
+@packed
+def _break_away_share(
+    j: JackLaw, p: PathPiece, hold: Vector, way: Vector, begin: Vector, end: Vector, seeks: Mask
+) -> Vector:
+    """Share at which the force on resting jacks exceeds `hold` (N, signed) along `way`.
+
+    It does so at `end`, where `seeks`.
+    """
+    at_begin = -way * excess_force(j, position_on_piece(p, begin), hold)
+    at_end = -way * excess_force(j, position_on_piece(p, end), hold)
+    there, seeks = begin, seeks & (at_begin > 0.0)
+    b = _Bracket(begin, end, at_begin, at_end, begin * 0.0)
+    for _ in range(JACK_STEPS.iterations):
+        if not any_lane(seeks):
+            break
+        q = _secant_share(b)
+        x = position_on_piece(p, q)
+        value = -way * excess_force(j, x, hold)
+        b = _narrowed(b, q, value)
+        limit = JACK_STEPS.force_tolerance * absolute(hold) * stage_resistance(j, x)
+        near = absolute(value) < limit
+        # Not `high`: where the path is straight the first share is the root, from either side.
+        there = where(seeks, where(near, q, b.high), there)
+        seeks = seeks & ~near & (b.high - b.low >= JACK_STEPS.least_share)
+    return there
+
+
+@packed
+def _stop_share(
+    j: JackLaw, p: PathPiece, load: Vector, velocity: Vector, d: Vector, later: Vector,
+    begin: Vector, end: Vector, seeks: Mask,
+) -> Vector:  # fmt: skip
+    """Share at which jacks stop, `velocity` at `begin`, `later` at `end`; where `seeks`."""
+    there, seeks = end, seeks & (velocity * d > 0.0) & (later * d < 0.0)
+    b = _Bracket(begin, end, velocity * d, later * d, begin * 0.0)
+    for _ in range(JACK_STEPS.iterations):
+        if not any_lane(seeks):
+            break
+        q = _secant_share(b)
+        value = _radau_to(j, p, load, velocity, begin, q) * d
+        b = _narrowed(b, q, value)
+        near = absolute(value) < JACK_STEPS.least_velocity
+        there = where(seeks, where(near, q, b.high), there)
+        seeks = seeks & ~near & (b.high - b.low >= JACK_STEPS.least_share)
+    return there
+
+
+@large_packed
+def linear_events(
+    o: int, these: Vector, span: Vector, x0: Vector, x1: Vector, rise0: Vector, rise1: Vector,
+    begin: float, stop: float, state: Array, coefficients: Array,
+) -> None:  # fmt: skip
+    """Jack of a linear second stage over the shares begin … stop of a piece, with stops and starts.
+
+    Of the lanes from `o` in which `these` is not 0; the other numbers are those of a `PathPiece`.
+    """
+    j, goes = jack_laws(coefficients, o), these != 0.0
+    mine = goes
+    place, velocity = (
+        load(state, ROWS.jack * LANES + o),
+        load(state, ROWS.jack_velocity * LANES + o),
+    )
+    d, fresh = load(state, ROWS.jack_direction * LANES + o), load(state, ROWS.fresh * LANES + o)
+    zero = d * 0.0
+    one = zero + 1.0
+    piece = PathPiece(where(mine, span, 1.0), x0, x1, rise0, rise1)
+    spring, x = j.spring * place, position_on_piece(piece, zero + stop)
+    up, down = excess_force(j, x, spring + j.static), excess_force(j, x, spring - j.static)
+    goes = goes & ~((d == 0.0) & (up <= 0.0) & (down >= 0.0))
+    near = where(x0 * x1 > 0.0, minimum(absolute(x0), absolute(x1)), 0.0)
+    fine = maximum(near * JACK_STEPS.travel_share, JACK_STEPS.travel)
+    wanted = (stop - begin) * absolute(x1 - x0) / fine
+    # The collocation is slow to forget what a start or a stop leaves.
+    rate = (j.area / stage_resistance(j, near) + j.viscosity) * j.by_mass
+    decay = (stop - begin) * piece.span * rate * (1.0 / JACK_STEPS.decay)
+    wanted = where((d != 0.0) & (fresh == 0.0), wanted, maximum(wanted, decay))
+    count, most = one, 1
+    while most < JACK_STEPS.most and any_lane(goes & (wanted >= most * 1.0)):
+        count = where(wanted >= most * 1.0, count + 1.0, count)
+        most += 1
+    q, step, by_count, fresh = zero + begin, one, (stop - begin) / count, zero
+    while any_lane(goes):
+        end = where(step == count, stop, begin + by_count * step)
+        spring, x = j.spring * place, position_on_piece(piece, end)
+        up, down = excess_force(j, x, spring + j.static), excess_force(j, x, spring - j.static)
+        stays = ((up <= 0.0) & (down >= 0.0)) | (
+            (absolute(place) >= j.stroke) & (place * (up + down) > 0.0)
+        )
+        starts = goes & (d == 0.0) & ~stays
+        if any_lane(starts):
+            way = where(up > 0.0, one, -one)
+            away = _break_away_share(j, piece, spring + j.static * way, way, q, end, starts)
+            q, d = where(starts, away, q), where(starts, way, d)
+            velocity, fresh = where(starts, 0.0, velocity), where(starts, 1.0, fresh)
+        moves, there = goes & (d != 0.0), end
+        stops = moves & ~moves
+        if any_lane(moves):
+            hold = j.load + spring + d * j.friction
+            later = _radau_to(j, piece, hold, velocity, q, end)
+            stops = moves & ~(later * d > 0.0)
+            if any_lane(stops):
+                at = _stop_share(j, piece, hold, velocity, d, later, q, end, stops)
+                there, later = where(stops, at, end), where(stops, 0.0, later)
+            moved = place + 0.5 * (there - q) * piece.span * (velocity + later)
+            place, velocity = where(moves, moved, place), where(moves, later, velocity)
+            meets = moves & (absolute(place) >= j.stroke) & (place * velocity > 0.0)
+            place = where(meets, copy_sign(j.stroke, place), place)
+            velocity, fresh = where(meets, 0.0, velocity), where(stops, 1.0, fresh)
+            d = where(stops | meets, 0.0, d)
+        ends = ~stops | (end - there < JACK_STEPS.least_share)
+        q, step = where(ends, end, there), where(ends, step + 1.0, step)
+        goes = goes & (step <= count)
+    _keep(o, mine, place, velocity, d, fresh, state)
+
+
 PIECE_NUMBERS = 4 * VECTOR_WIDTH
 """Numbers of a piece, VECTOR_WIDTH lanes each: duration (s; 0 in a lane that has no such piece),
 place at the end, velocities at start and end."""
@@ -242,16 +419,9 @@ def jack_over_pieces(
 ) -> None:
     """Jack over a tick, by `count` pieces, of the lanes from `o` in which `these` is not 0.
 
-    After a start or a stop it takes some steps a piece. A lane in which it starts or stops within a
-    piece goes over that alone, and one whose second stage, lands or sensor are not the plain ones
-    over all of them.
+    A lane whose second stage, lands or sensor are not the plain ones goes over them alone.
     """
     j, law = jack_laws(coefficients, o), sensor_laws(coefficients, o)
-    place, velocity = (
-        load(state, ROWS.jack * LANES + o),
-        load(state, ROWS.jack_velocity * LANES + o),
-    )
-    d, fresh = load(state, ROWS.jack_direction * LANES + o), load(state, ROWS.fresh * LANES + o)
     plain = (j.shaped == 0.0) & (law.lag + law.lead == 0.0) & (these != 0.0)
     orifice = plain & (j.oil > 0.0)
     plain = plain & (j.oil == 0.0) & (j.extra == 0.0)
@@ -270,87 +440,15 @@ def jack_over_pieces(
             )  # fmt: skip
         here = plain & (span > 0.0)
         if any_lane(here):
-            hold = j.spring * place
-            up, down = excess_force(j, x1, hold + j.static), excess_force(j, x1, hold - j.static)
-            rests = here & (d == 0.0) & (up <= 0.0) & (down >= 0.0)
-            slides = here & (d != 0.0)
-            if any_lane(slides):
-                piece = PathPiece(
-                    span, x0, x1, load(pieces, k + 2 * VECTOR_WIDTH) * span,
-                    load(pieces, k + 3 * VECTOR_WIDTH) * span,
-                )  # fmt: skip
-                near = where(x0 * x1 > 0.0, minimum(absolute(x0), absolute(x1)), 0.0)
-                fine = maximum(near * JACK_STEPS.travel_share, JACK_STEPS.travel)
-                many = slides & ((fresh != 0.0) | (absolute(x1 - x0) >= fine))
-                slides = slides & ~many
-                if any_lane(many):
-                    rate = (j.area / stage_resistance(j, near) + j.viscosity) * j.by_mass
-                    wanted = absolute(x1 - x0) / fine
-                    decay = where(fresh != 0.0, span * rate * (1.0 / JACK_STEPS.decay), 0.0)
-                    many, place, velocity = _in_steps(
-                        j, piece, many, maximum(wanted, decay), d, place, velocity
-                    )
-                xa, xb = position_on_piece(piece, RADAU.c1), position_on_piece(piece, RADAU.c2)
-                later = radau_velocity(
-                    j, span, j.load + hold + d * j.friction, velocity, xa, xb, x1,
-                    stage_resistance(j, xa), stage_resistance(j, xb), stage_resistance(j, x1),
-                )  # fmt: skip
-                moved = place + 0.5 * span * (velocity + later)
-                slides = slides & (later * d > 0.0) & (absolute(moved) < j.stroke)
-                place, velocity = where(slides, moved, place), where(slides, later, velocity)
-                slides = slides | many
-            alone = here & ~rests & ~slides
-            fresh = where(rests | slides, 0.0, fresh)
-            if any_lane(alone):
-                _keep(o, plain, place, velocity, d, fresh, state)
-                store(pieces, SINGLE_LANE_FLAGS, where(alone, 1.0, 0.0))
-                _single_lanes(o, n, n + 1, tick, state, path, coefficients, pieces)
-                place = load(state, ROWS.jack * LANES + o)
-                velocity = load(state, ROWS.jack_velocity * LANES + o)
-                d, fresh = (
-                    load(state, ROWS.jack_direction * LANES + o),
-                    load(state, ROWS.fresh * LANES + o),
-                )
+            linear_events(
+                o, where(here, 1.0, 0.0), span, x0, x1,
+                load(pieces, k + 2 * VECTOR_WIDTH) * span,
+                load(pieces, k + 3 * VECTOR_WIDTH) * span, 0.0, 1.0, state, coefficients,
+            )  # fmt: skip
         x0 = where(span > 0.0, x1, x0)
-    _keep(o, plain, place, velocity, d, fresh, state)
     store(
         state, ROWS.done * LANES + o, where(these != 0.0, 1.0, load(state, ROWS.done * LANES + o))
     )
-
-
-@packed
-def _in_steps(
-    j: JackLaw, piece: PathPiece, these: Mask, wanted: Vector, d: Vector, place: Vector,
-    velocity: Vector,
-) -> tuple[Mask, Vector, Vector]:  # fmt: skip
-    """Sliding jack over a piece in as many steps as a lane alone would take, 1 + wanted of them.
-
-    Returns in which of the lanes it goes on sliding, and theirs moved.
-    """
-    zero = d * 0.0
-    count, most_steps = zero + 1.0, 1
-    while most_steps < JACK_STEPS.most and any_lane(these & (wanted >= most_steps * 1.0)):
-        count = where(wanted >= most_steps * 1.0, count + 1.0, count)
-        most_steps += 1
-    begin, at, speed, by_count = zero, place, velocity, (zero + 1.0) / count
-    for step in range(1, most_steps + 1):
-        goes = these & (count >= step * 1.0)
-        end = where(count == step * 1.0, 1.0, by_count * (step * 1.0))
-        width = end - begin
-        xa, xb = (
-            position_on_piece(piece, begin + RADAU.c1 * width),
-            position_on_piece(piece, begin + RADAU.c2 * width),
-        )
-        xe, h = position_on_piece(piece, end), width * piece.span
-        later = radau_velocity(
-            j, h, j.load + j.spring * at + d * j.friction, speed, xa, xb, xe,
-            stage_resistance(j, xa), stage_resistance(j, xb), stage_resistance(j, xe),
-        )  # fmt: skip
-        moved = at + 0.5 * h * (speed + later)
-        these = these & (~goes | ((later * d > 0.0) & (absolute(moved) < j.stroke)))
-        at, speed = where(goes, moved, at), where(goes, later, speed)
-        begin = end
-    return these, where(these, at, place), where(these, speed, velocity)
 
 
 @packed

@@ -17,16 +17,15 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.simd_jack import (
-    jack_lanes,
+    jack_tick,
     land_opening_lanes,
     orifice_level,
     orifice_tick,
     rest_jack_lanes,
     sampled_pressures,
-    sensed_jack_lanes,
+    sensed_jack_tick,
     sensed_orifice_tick,
 )
-from ehadiag.model.simd_jack_pieces import jack_events
 from ehadiag.model.simd_layout import BLOCK, MAX_JACK_HALVINGS, BlockTraits, block_part
 from ehadiag.model.simd_spool import (
     creep_lanes,
@@ -86,16 +85,6 @@ def _jack_level(path: Array) -> int:
     return level
 
 
-@packed
-def _jack_tick(
-    count: int, end: int, tick: float, level: int, state: Array, path: Array, coefficients: Array
-) -> None:
-    """Jack of all lanes over a tick cut into 2^level steps."""
-    for step in range(1 << level):
-        if jack_lanes(end, level, step, tick, state, path, coefficients):
-            jack_events(count, level, step, tick, state, path, coefficients)
-
-
 @bare_kernel
 def _other_jack_tick(
     count: int,
@@ -109,7 +98,7 @@ def _other_jack_tick(
     coefficients: Array,
     scratch: Array,
 ) -> None:
-    """The same of an orifice stage, or with the pressure as the filter before its converter has it.
+    """Jack of all lanes over a tick, behind orifices or with the pressure as its filter has it.
 
     Apart from the plain one, so that this stays as it is.
     """
@@ -118,9 +107,7 @@ def _other_jack_tick(
     elif orifice:
         orifice_tick(count, end, tick, level, state, path, coefficients, scratch)
     else:
-        for step in range(1 << level):
-            if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
-                jack_events(count, level, step, tick, state, path, coefficients)
+        sensed_jack_tick(count, end, tick, level, state, path, coefficients)
 
 
 @merged
@@ -181,6 +168,6 @@ def advance_block(
                 block_part(address, BLOCK.scratch, BLOCK.end),
             )  # fmt: skip
         else:
-            _jack_tick(count, end, tick, level, state, path, coefficients)
+            jack_tick(count, end, tick, level, state, path, coefficients)
         sampled_pressures(end, has.senses or has.orifice, state, path, coefficients)
     return level
