@@ -329,6 +329,8 @@ def _with_one_play(session: CalibrationSession, found: LearnedModel) -> LearnedM
     begin = {**values, HYSTERESIS_NAME: 2.0 * mean_place * values[HYSTERESIS_NAME]}
     others = tuple(name for name in significant_effects(found) if name != SKEW_NAME)
     one_play = _learn_from(session, replace(found.model, plays=1), others, begin, 0)
+    if found.estimated.explained and not one_play.estimated.explained:
+        return found
     more = one_play.criterion - found.criterion
     return one_play if more < SEARCHES.max_same_cost_difference else found
 

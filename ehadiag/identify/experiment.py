@@ -119,9 +119,11 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
     sampled: Array = msgspec.field(default_factory=lambda: np.empty(0))
     """When the channels of `acquired` were sampled, s on its clock; empty without it."""
     creep_end: int = 0
-    """Ticks in which what comes after a hold does not count."""
+    """Tick before which what comes after a hold (the pressure is missing until then) does not
+    count."""
     followed: bool = False
-    """Whether a model follows the spool's sensor until then."""
+    """Whether a model follows the spool's sensor until then; searches take the sensor's offset as
+    added all the same, which it is not where the spool moves later than that."""
 
     @property
     def ticks(self) -> int:

@@ -199,7 +199,7 @@ def estimate_about(
         else:
             late, begin = fine, replace(density, root=FINAL_SPREAD_RATIO * density.root)
             whole = [a.with_noise(b.noise) for a, b in zip(experiments, judged, strict=True)]
-            for items in (whole, judged):
+            for items in (whole, judged) if any(item.creep_end for item in judged) else (judged,):
                 evaluations += fine.evaluations
                 fine = model_of(items)
                 end = search(fine, begin=begin)

@@ -226,11 +226,11 @@ def _density_about_end(
     near that of the end. root: of the covariance where more than that is wrong.
     """
     names = [model.estimated[j].name for j in model.curved]
+    points = RESTARTS.alias_points if is_near(end.residuals) else RUN_BLOCK_SIZE
     if alias in names and explains_spool(end.residuals):
         root, place = RESTARTS.end_spread * end.density.root, names.index(alias)
         root[place], root[:, place] = 0.0, 0.0
-        root[place, place] = 2.0 * RESTARTS.alias_half_span / RESTARTS.alias_points
-    points = RESTARTS.alias_points if is_near(end.residuals) else RUN_BLOCK_SIZE
+        root[place, place] = 2.0 * RESTARTS.alias_half_span / points
     return ParameterDensity(_best_along_alias(model, end, alias, points), root)
 
 

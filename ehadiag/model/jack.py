@@ -1,7 +1,8 @@
-"""Jack with a linear second stage over a piece of the spool's path: one algorithm for all kernels.
+"""Jack of a lane alone, with a linear second stage, over a piece of the spool's path.
 
 A piece is cut into steps of the collocation (`ehadiag.model.sensors`). Stops and starts are
-located inside of it.
+located inside of it. `ehadiag.model.simd_jack_pieces.linear_events` is the same side by side, but
+for how roots are found: they agree to their tolerance.
 """
 
 from __future__ import annotations

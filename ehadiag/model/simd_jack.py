@@ -1,7 +1,7 @@
 """Second stage and jack of a block of candidates over a step, one lane each.
 
-One step of the linear second stage or of the one of orifices for all lanes; a lane whose jack
-stops, starts or meets its stop takes that step alone (`ehadiag.model.simd_jack_pieces`).
+One step of the linear second stage or of the one of orifices for all lanes; those whose jack
+stops, starts or meets its stop take that step by finer ones (`ehadiag.model.simd_jack_pieces`).
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ from ehadiag.model.simd_layout import (
 
 
 class LaneSteps(NamedTuple):
-    """Steps of the jack of a block; a lane with a larger one is computed alone."""
+    """Steps of the jack of a block; a lane with a larger one takes finer ones."""
 
     travel: float = 8.0e-6
     """Spool travel from first to last stage of a step, m; further from the middle, its distance."""
@@ -123,7 +123,7 @@ def _stages() -> Array:
 
 
 STAGE_TABLE = _stages()
-NODE_HALVINGS = 2
+NODE_HALVINGS = LANE_NODES.bit_length() - 1
 """Halvings of a tick up to which its steps end at nodes of the path, 1."""
 
 
@@ -334,7 +334,7 @@ def _jack_tick(senses: bool) -> Any:
 
 jack_tick, sensed_jack_tick = _jack_tick(False), _jack_tick(True)
 """Compiled: jack of all lanes over a tick cut into 2^level steps; with the second one their
-pressure as the filter before its converter has it. A lane with an event takes its step alone."""
+pressure as the filter before its converter has it."""
 
 
 @packed

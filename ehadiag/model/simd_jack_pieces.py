@@ -304,7 +304,7 @@ def _break_away_share(
         value = -way * excess_force(j, x, hold)
         b = _narrowed(b, q, value)
         limit = JACK_STEPS.force_tolerance * absolute(hold) * stage_resistance(j, x)
-        near = absolute(value) < limit
+        near = absolute(value) <= limit
         # Not `high`: where the path is straight the first share is the root, from either side.
         there = where(seeks, where(near, q, b.high), there)
         seeks = seeks & ~near & (b.high - b.low >= JACK_STEPS.least_share)
@@ -427,7 +427,7 @@ def jack_over_pieces(
     plain = plain & (j.oil == 0.0) & (j.extra == 0.0)
     if any_lane((these != 0.0) & ~plain & ~orifice):
         store(pieces, SINGLE_LANE_FLAGS, where(plain | orifice, 0.0, these))
-        _single_lanes(o, 0, count, tick, state, path, coefficients, pieces)
+        _single_lanes(o, count, tick, state, path, coefficients, pieces)
     x0 = load(path, LANE_PATH * LANES + o)
     for n in range(count):
         k = n * PIECE_NUMBERS
@@ -466,7 +466,6 @@ def _keep(
 @bare_kernel
 def _single_lanes(
     o: int,
-    first: int,
     count: int,
     tick: float,
     state: Array,
@@ -474,7 +473,7 @@ def _single_lanes(
     coefficients: Array,
     pieces: Array,
 ) -> None:
-    """Jack of the lanes that go alone, one after the other, over the pieces first … count - 1."""
+    """Jack of the lanes that go alone, one after the other, over the first `count` pieces."""
     for lane in range(VECTOR_WIDTH):
         if pieces[SINGLE_LANE_FLAGS + lane] == 0.0:
             continue
@@ -487,15 +486,10 @@ def _single_lanes(
             k = n * PIECE_NUMBERS + lane
             span, to_xs = pieces[k], pieces[k + VECTOR_WIDTH]
             if span > 0.0:
-                if n >= first:
-                    rise0, rise1 = (
-                        pieces[k + 2 * VECTOR_WIDTH] * span,
-                        pieces[k + 3 * VECTOR_WIDTH] * span,
-                    )
-                    piece = land_opening_piece(j, PathPiece(span, from_xs, to_xs, rise0, rise1))
-                    jack = jack_piece(
-                        j, PressureProbe(sensor.lag, due), senses, piece, 0.0, 1.0, jack
-                    )
+                rise0 = pieces[k + 2 * VECTOR_WIDTH] * span
+                rise1 = pieces[k + 3 * VECTOR_WIDTH] * span
+                piece = land_opening_piece(j, PathPiece(span, from_xs, to_xs, rise0, rise1))
+                jack = jack_piece(j, PressureProbe(sensor.lag, due), senses, piece, 0.0, 1.0, jack)
                 due -= span
                 from_xs = to_xs
         keep_lane_jack(jack, state, i)

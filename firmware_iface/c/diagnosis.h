@@ -57,7 +57,7 @@ void fcc_diagnosis_init(struct fcc_diagnosis *diagnosis);
 size_t fcc_diagnosis_tick(struct fcc_diagnosis *diagnosis, const struct fcc_node *node,
                           const uint16_t codes[4], struct fcc_frame frames[FCC_DIAGNOSIS_FRAMES]);
 
-/* Go on for at least so many ticks of a model; false if there is nothing to do. */
+/* Go on for about so many ticks of a model, fewer where a pass ends; false if there is nothing to do. */
 bool fcc_diagnosis_work(struct fcc_diagnosis *diagnosis, double work);
 
 #endif
