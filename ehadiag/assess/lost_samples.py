@@ -89,8 +89,6 @@ class ReconstructionRules(msgspec.Struct, frozen=True):
     """Largest number of rows moved together next to a gap, 1; besides all up to the next gap."""
     max_rows: int = 40
     """Largest number of the latter, 1."""
-    residual_cap: float = 9.0
-    """Largest square of a residual that counts, in variances."""
     current_cap: float = 16.0
     """Largest square of a residual of the current that counts, in variances."""
     current_noise_lsb: float = 0.6
@@ -310,7 +308,7 @@ class _RowReconstruction:
         trace, noise = item.trace, RECONSTRUCTION.current_noise_lsb * item.channels.current.lsb
         current = np.nan_to_num((samples.current - trace.offset - trace.current) / noise)
         return np.asarray(
-            np.minimum(left**2, RECONSTRUCTION.residual_cap).sum(axis=0)
+            np.minimum(left**2, ESTIMATION.residual_cap).sum(axis=0)
             + np.minimum(current**2, RECONSTRUCTION.current_cap)
         )
 

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import ESTIMATION, RESPONSE
+from ehadiag.core.criteria import ESTIMATION, FIT, RESPONSE
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
@@ -59,8 +59,6 @@ class DelayRegression(msgspec.Struct, frozen=True):
     """Largest number of corrections, 1."""
     regressions: int = 5
     """Number of regressions, 1, each without the outliers of the one before."""
-    correlation_ticks: int = 20
-    """Ticks over which the model error is correlated, 1."""
     fit_iterations: int = 8
     """Iterations of the position sensor's robust fit, 1."""
 
@@ -196,7 +194,7 @@ def _delay(name: str, measured: Array, modelled: Array) -> Delay:
         spread = 1.4826 * float(np.nanmedian(np.abs(away)))
         std = spread / float(np.sqrt(power))
         used = np.isfinite(left) & (np.abs(away) <= DELAYS.max_residual_stds * spread)
-    return Delay(name, float(value), std * float(np.sqrt(DELAYS.correlation_ticks)))
+    return Delay(name, float(value), std * float(np.sqrt(ESTIMATION.correlation_lags)))
 
 
 TRAVEL_SPAN_S = 0.1
@@ -277,7 +275,7 @@ def objections_to_position(
     fit: PositionFit, max_gain_error: float = RESPONSE.max_position_gain_error
 ) -> list[str]:
     """Reasons why the position sensor is not trusted; max_gain_error: largest error of its gain."""
-    if fit.gain < RESPONSE.max_reversed_position_gain:
+    if fit.gain < FIT.max_reversed_gain:
         return ["the position sensor reads with the wrong sign"]
     if fit.gain < RESPONSE.min_position_gain:
         return ["the position sensor does not follow the jack: dead, frozen, or another signal"]

@@ -29,16 +29,11 @@ class VerdictCriteria(msgspec.Struct, frozen=True):
     limit: float = 0.75
     """Severity from which a unit has a FAULT, 1 (PHY-12)."""
     max_chance_false_healthy: float = 0.025
-    """Largest chance that a severity is at or above the advisory level for HEALTHY, 1: the specific
-    consumer's risk of JCGM 106:2012."""
+    """Largest chance that a severity is at or above the advisory level for HEALTHY, or another
+    fault beyond its limit without a note, 1: the specific consumer's risk of JCGM 106:2012."""
     min_chance_fault: float = 0.5
-    """Least chance that a severity is at or above the limit for FAULT, 1: simple acceptance, JCGM
-    106:2012, 8.2."""
-    min_chance_beyond_limit: float = 0.5
-    """Least chance that another fault is beyond its limit for DEGRADED, 1: simple acceptance."""
-    min_chance_for_note: float = 0.025
-    """Least chance that another fault is beyond its limit for a note, 1: as
-    `max_chance_false_healthy`."""
+    """Least chance that a severity is at or above the limit for FAULT, or another fault beyond its
+    limit for DEGRADED, 1: simple acceptance, JCGM 106:2012, 8.2."""
 
 
 VERDICT = VerdictCriteria()
@@ -78,8 +73,6 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     """Largest rms residual of the current, in deviations of the noise."""
     max_control_residual_lsb: float = 4.0
     """Largest rms residual of the current against the control law, LSB."""
-    min_sample_share_early: float = 0.75
-    """Least share of samples for estimating from a test that still runs, 1."""
 
 
 RECORDING = RecordingCriteria()
@@ -105,8 +98,6 @@ class ReadingCriteria(msgspec.Struct, frozen=True):
     """Least correlation of the jack's travel with the spool's flow, 1: 0.988 at least on 80 sound
     units with all effects, data 5 % off and orifices, 0.84 with a sensor 50 ms late; 0.33 to -1
     with another signal."""
-    max_reversed_travel_correlation: float = -0.7
-    """Largest correlation of travel and flow of a sensor with the wrong sign, 1."""
     max_actuator_ratio_factor: float = 30.0
     """Largest factor between a ratio of actuator data and its usual value, 1."""
 
@@ -137,7 +128,8 @@ class FitCriteria(msgspec.Struct, frozen=True):
     """Mean of Cauchy's cost that an excess is over, 1. A standard normal residual has 0.874, 1.4 %
     more; the limits of excess on this page were set with this value."""
     max_outliers_of_noise: float = 0.01
-    """Largest share of residuals beyond three deviations where nothing is left to explain, 1."""
+    """Largest share of residuals beyond three deviations where nothing is left to explain, and no
+    further unknowns are needed, 1."""
     max_explained_excess: float = 1.25
     """Largest excess of an explained signal, 1: 1.02 to 1.15 at the optimum of 80 simulated
     tests."""
@@ -148,8 +140,6 @@ class FitCriteria(msgspec.Struct, frozen=True):
     """Largest standard deviation of a severity that the test shows, 1."""
     bound_tolerance: float = 1e-6
     """Distance of a severity from its bound at which it is on it, 1."""
-    max_fit_outliers: float = 0.01
-    """Largest share of residuals beyond three deviations that needs no further unknowns, 1."""
     max_start_outliers: float = 0.15
     """Largest share of outliers of a start for the severities alone, 1: mostly 0.04 at most on a
     textbook's actuator, 0.29 and more on others; between break-aways a search may end away from the
@@ -219,16 +209,14 @@ class GiveUpCriteria(msgspec.Struct, frozen=True):
     min_other_end_gain: float = 30.0
     """Least gain in objective of another place, 1."""
     max_trial_share: float = 0.5
-    """Largest share of the excess over noise that an effect leaves on trial, 1: loads of 20 to 80 N
-    left 1.1 of 1.3 to 2.0, broken hardware as much as before."""
+    """Largest share of the excess over noise that an effect on trial, effects that have changed
+    since a calibration, or another exponent leave, 1: loads of 20 to 80 N left 1.1 of 1.3 to 2.0,
+    broken hardware as much as before."""
     max_load_trial_excess: float = 15.0
     """Largest excess after all nuisances for which a load is tried, 1."""
     max_unchanged_excess: float = 1.3
     """Largest excess by a calibration's prior of an unchanged unit, 1: wear shows what its model
     leaves out, which loosened effects would replace."""
-    max_changed_share: float = 0.5
-    """Largest share of the excess over noise that may remain where effects have changed since,
-    1."""
     min_unambiguous_hysteresis: float = 5e-3
     """Full relative width of hysteresis below which closed loop keeps the spool breaking away,
     1."""
@@ -254,8 +242,6 @@ class ResponseCriteria(msgspec.Struct, frozen=True):
     """Least rms travel over the span for a gain, LSB."""
     min_position_gain: float = 0.2
     """Least gain of a position sensor that follows the jack, 1."""
-    max_reversed_position_gain: float = -0.5
-    """Largest gain of a position sensor with the wrong sign, 1."""
     max_position_gain_error: float = 0.1
     """Largest error of the position sensor's gain, 1: twice that of flow gain and jack area 5 %
     off."""
@@ -347,10 +333,10 @@ class EstimationRules(NamedTuple):
     """Mean absolute value of a standard normal variable without its largest 2 %, 1."""
     min_rest_samples: int = 20
     """Least number of samples at rest from which an offset is taken, 1."""
-    residual_cap: float = 9.0
-    """Largest square of one weighted residual that counts, in variances."""
     cauchy_scale: float = 3.0
     """Scale of Cauchy's cost, in deviations: larger residuals count little."""
+    residual_cap: float = cauchy_scale**2
+    """Largest square of one weighted residual that counts, in variances."""
     max_row_scatter: float = 1.0
     """Scatter about the linear model from which a sample is left out, in variances."""
     max_informative_scatter: float = 0.03
@@ -362,7 +348,7 @@ class EstimationRules(NamedTuple):
     """Relative change of the noise up to which the refinement is not repeated, 1."""
     correlation_lags: int = 20
     """Ticks over which residuals are correlated, 1."""
-    capped_variance: float = _capped_variance(3.0)
+    capped_variance: float = _capped_variance(cauchy_scale)
     """Mean square of a standard normal variable without its values beyond `cauchy_scale`, 1."""
     refined_std: float = 3e-4
     """Standard deviation of a severity about a refined optimum, 1."""

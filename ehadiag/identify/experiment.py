@@ -416,7 +416,7 @@ def _mean_of_motion(pressure: Array, test: StoredTest) -> float:
         inside |= (begin < time) & (time <= end)
     seen = pressure[inside & np.isfinite(pressure)]
     needed = sum(end - begin for begin, end in test.windows.refinement) * test.rate
-    return float(seen.mean()) if seen.size > RECORDING.min_sample_share_early * needed else 0.0
+    return float(seen.mean()) if seen.size > (1.0 - RECORDING.max_missing_share) * needed else 0.0
 
 
 def _slides(position: Array, channel: Channel) -> bool:

@@ -62,9 +62,9 @@ class RestartRules(msgspec.Struct, frozen=True):
     spread_share: float = 0.1
     """Spread about the best end so far, in spreads of the first."""
     end_spread: float = 3.0
-    """Spread of a look about an end that misses only the pressure, in spreads of that end: with
-    such looks 1 of 40 units ended beside the optimum, 13 without (ADR 23); other spreads were not
-    recorded."""
+    """Spread of a look about an end that misses only the pressure, and of the last one with the
+    noise as judged, in spreads of that end: with such looks 1 of 40 units ended beside the optimum,
+    13 without (ADR 23); other spreads were not recorded."""
     alias_half_span: float = 1.25
     """Half-width over which a parameter is moved against its alias, in units of its scale."""
     alias_points: int = 128

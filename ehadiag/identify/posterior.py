@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, GIVE_UP, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
 
 MIN_GRADIENT_SHARE = 1e-9
@@ -90,8 +90,9 @@ class SearchSchedule(msgspec.Struct, frozen=True):
 
 
 MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
-    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000, flat=10.0
-)
+    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000,
+    flat=GIVE_UP.same_end_cost,
+)  # fmt: skip
 """Schedule for many unknowns."""
 SLOW_SCHEDULE = replace(
     MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, whole_rounds=70, width=3.0

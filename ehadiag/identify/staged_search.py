@@ -23,7 +23,8 @@ from ehadiag.identify.experiment import (
     lay_out_spans,
     unknowns_of,
 )
-from ehadiag.identify.solvers import Objective, SearchResult, Solver
+from ehadiag.identify.linearisation import RUN_BLOCK_SIZE
+from ehadiag.identify.solvers import SEARCH_CAP, Objective, SearchResult, Solver
 from ehadiag.model.batch import Batch
 from ehadiag.model.registry import FAULTS, Unknowns
 from ehadiag.model.residual_models import SimdModel
@@ -35,11 +36,11 @@ from firmware_iface.stored_test import StoredTest, TimeWindow
 class StageRules(NamedTuple):
     """Grids and stages of the global search."""
 
-    coarse_points: int = 32
+    coarse_points: int = 2 * RUN_BLOCK_SIZE
     """Points of the coarse search over 0 … 1."""
     repeated_ranges: tuple[tuple[float, float], ...] = ((0.2, 0.06), (0.05, 0.02))
     """Half-widths of the repeated searches in the slewing and the creeping spool, 1."""
-    fine_points: int = 16
+    fine_points: int = RUN_BLOCK_SIZE
     """Points of a finer grid, 1."""
     finest_spacing: float = 6e-4
     """Spacing of the last grid, 1."""
@@ -52,7 +53,7 @@ class StageRules(NamedTuple):
     """Sweeps over the severities that the driven jack shows, 1, where there are several."""
     first_run_in_s: float = 0.05
     """Run-in of the first approximation, s."""
-    pressure_cap: float = 25.0
+    pressure_cap: float = SEARCH_CAP
     """Largest square of a residual of the pressure, in variances."""
     spool_cap: float = 100.0
     """Largest square of a residual of the spool, in variances: a stick-slip jump at another tick
