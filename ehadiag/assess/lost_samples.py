@@ -78,11 +78,13 @@ class ReconstructionRules(msgspec.Struct, frozen=True):
     response_ticks: int = 30
     """Ticks in which a wrong current shows, 1."""
     spacing_per_run: int = 40
-    """Least spacing of two changes tried in one run of the model, ticks."""
+    """Least spacing of two changes tried in one run of the model, ticks: longer than
+    `response_ticks`, in which each shows."""
     spacing_per_sweep: int = 8
     """Least spacing of two changes made at once, ticks."""
     code_offsets: tuple[int, ...] = (0, -1, 1, -2, 2)
-    """Distances of a lost position from a straight line between its neighbours, LSB."""
+    """Distances of a lost position from a straight line between its neighbours, LSB: its noise and
+    rounding are 0.6 LSB."""
     position_variance_lsb2: float = 1.3
     """Variance of that distance by noise, rounding and the straight line, LSB²."""
     max_rows_of_run: int = 3

@@ -43,7 +43,8 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     """Limits of a recording that can be judged."""
 
     max_frame_delay_s: float = 0.05
-    """Longest delay of a frame after its tick, s; a later one counts as lost."""
+    """Longest delay of a frame after its tick, s; a later one counts as lost. Stamps up to that
+    late left a verdict as it was (docs/reference/bus-faults.md)."""
     max_missing_share: float = 0.25
     """Largest share of missing samples of a channel, 1: tried in docs/reference/bus-faults.md."""
     max_missing_share_without_counter: float = 0.4
@@ -52,7 +53,8 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     max_sample_spacing_ticks: int = 2
     """Largest regular spacing of samples, ticks: half the control rate suffices for a diagnosis."""
     max_sample_gap_s: float = 0.25
-    """Longest span without a sample, s."""
+    """Longest span without a sample, s: a diagnosis without 0.2 s of the steps stayed the same
+    (docs/reference/bus-faults.md)."""
     min_command_frames: int = 100
     """Least number of command frames that show the resolution of the command, 1."""
     min_current_share_without_command: float = 0.4
@@ -70,7 +72,8 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     min_supply_pressure_share: float = 0.5
     """Least supply pressure, as a share of that in the actuator file, 1."""
     max_current_residual_stds: float = 2.0
-    """Largest rms residual of the current, in deviations of the noise."""
+    """Largest rms residual of the current, in deviations of the noise: noise alone, whose rms is 1,
+    does not make it."""
     max_control_residual_lsb: float = 4.0
     """Largest rms residual of the current against the control law, LSB."""
 
@@ -82,7 +85,8 @@ class ReadingCriteria(msgspec.Struct, frozen=True):
     """Limits of plausible units, signs, motion and actuator data."""
 
     max_reading_factor: float = 10.0
-    """Largest reading over what the actuator can reach, 1."""
+    """Largest reading over what the actuator can reach, 1: no sensor reads more, whatever is wrong
+    with it."""
     min_channel_correlation: float = 0.8
     """Least correlation of two channels that shows their units, 1."""
     max_channel_ratio_error: float = 0.25
@@ -110,7 +114,8 @@ class FitCriteria(msgspec.Struct, frozen=True):
 
     max_outlier_share: float = 0.015
     """Largest share of residuals beyond three deviations for a verdict, 1: five to six times that
-    of noise, `NOISE_OUTLIER_SHARE`."""
+    of noise, `NOISE_OUTLIER_SHARE`. Textbook units had 0.0058 at most (`tools/study cube`), with
+    1 % of hysteresis more than 0.02 (ADR 4 at 4fd82576)."""
     max_rms: float = 1.25
     """Largest rms residual for a verdict, in deviations of the noise."""
     outlier_factor_further_effects: float = 6.0
@@ -221,9 +226,11 @@ class GiveUpCriteria(msgspec.Struct, frozen=True):
     """Full relative width of hysteresis below which closed loop keeps the spool breaking away,
     1."""
     max_last_part_step: float = 3.0
-    """Longest step by the last part of a test, in deviations of the first part."""
+    """Longest step by the last part of a test, in deviations of the first part: a longer one is
+    none of a small part, and the whole is refined (ADR 5)."""
     max_severity_step: float = 1.0
-    """The same of a severity, in its deviations; beyond, the whole test is refined."""
+    """The same of a severity, in its deviations: beyond, one step does not lead to the optimum of
+    the whole test."""
     max_cost_rise: float = 4.0
     """Largest rise of the cost by that step, 1: what break-aways make of a descent."""
 
@@ -334,11 +341,13 @@ class EstimationRules(NamedTuple):
     min_rest_samples: int = 20
     """Least number of samples at rest from which an offset is taken, 1."""
     cauchy_scale: float = 3.0
-    """Scale of Cauchy's cost, in deviations: larger residuals count little."""
+    """Scale of Cauchy's cost, in deviations: larger residuals count little. Noise alone has 0.3 %
+    of them, `NOISE_OUTLIER_SHARE`."""
     residual_cap: float = cauchy_scale**2
-    """Largest square of one weighted residual that counts, in variances."""
+    """Largest square of one weighted residual that counts, in variances: of `cauchy_scale`."""
     max_row_scatter: float = 1.0
-    """Scatter about the linear model from which a sample is left out, in variances."""
+    """Scatter about the linear model from which a sample is left out, in variances: as large as the
+    noise, it tells nothing."""
     max_informative_scatter: float = 0.03
     """The same, for how sure an optimum is: that of a jump by 0.6 deviations, twice what is taken
     for a break-away between two-sided differences; 0.02 on a cross, 0.033 in a regression."""
@@ -353,7 +362,8 @@ class EstimationRules(NamedTuple):
     refined_std: float = 3e-4
     """Standard deviation of a severity about a refined optimum, 1."""
     discrepancy_std: float = 3e-5
-    """Standard deviation of a severity between different integrations of a plant, 1."""
+    """Standard deviation of a severity between different integrations of a plant, 1: what estimates
+    differ by beyond the noise (ADR 4)."""
     uniform_std: float = 1.0 / math.sqrt(12.0)
     """Standard deviation of a severity that is uniform on 0 … 1, 1."""
     sampling_lead_std: float = 0.15e-6
@@ -372,7 +382,8 @@ class RefinementRules(NamedTuple):
     min_bound_distance: float = 0.25
     """Share of that distance to a bound below which the points lie on its other side, 1."""
     min_linear_ratio: float = 0.05
-    """Least ratio of widths in a round where the model is linear over the density, 1."""
+    """Least ratio of widths in a round where the model is linear over the density, 1: there is no
+    break-away to look past."""
     max_linear_scatter: float = 0.1
     """Scatter of a sample up to which the model is linear, in variances."""
     max_nonlinear_share: float = 0.01

@@ -103,7 +103,7 @@ class CompactGa(msgspec.Struct, frozen=True):
     """Evaluations at most."""
     virtual_population: float = 42.0
     samples: int = RUN_BLOCK_SIZE
-    """Individuals drawn a generation."""
+    """Individuals drawn a generation: a block of runs."""
     tolerance: float = 1e-6
     """Done when the deviation of every gene is below."""
     name: ClassVar[str] = "cga"
