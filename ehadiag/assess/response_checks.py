@@ -54,7 +54,8 @@ class DelayRegression(msgspec.Struct, frozen=True):
     travel_ticks: int = 20
     """Span of the jack's travel, ticks: its position drifts from the model's."""
     max_residual_stds: float = 4.0
-    """Largest residual of the regression, in deviations."""
+    """Largest residual of the regression, in deviations: noise alone exceeds it in six of a hundred
+    thousand samples."""
     corrections: int = 3
     """Largest number of corrections, 1."""
     regressions: int = 5
@@ -354,7 +355,8 @@ class StepRules(msgspec.Struct, frozen=True):
     """Break-aways of the spool in slow ramps."""
 
     noise_stds: float = 5.0
-    """Least travel in a tick of a break-away, in deviations of the noise of a difference."""
+    """Least travel in a tick of a break-away, in deviations of the noise of a difference, which
+    alone makes it in six of ten million ticks."""
     model_share: float = 0.5
     """The same of the model's, which has no noise, over it, 1."""
     min_count: int = 6

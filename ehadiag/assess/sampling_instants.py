@@ -48,7 +48,8 @@ class InstantRules(msgspec.Struct, frozen=True):
     settled: float = 1e-4
     """Share of the cost by which a step must lower it to be followed by another, 1."""
     most_stds: float = 4.0
-    """Largest residual that counts, in deviations of all."""
+    """Largest residual that counts, in deviations of all: noise alone exceeds it in six of a
+    hundred thousand samples."""
     fits: int = 6
     """Fits of one step, 1, each without the outliers of the one before."""
     sufficient_share: float = 0.99

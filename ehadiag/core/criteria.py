@@ -277,7 +277,8 @@ class ResponseCriteria(msgspec.Struct, frozen=True):
     min_delay_ticks: float = 0.05
     """Least delay of a signal that is corrected, ticks."""
     min_delay_stds: float = 5.0
-    """Least delay of a signal that is corrected, in its deviations."""
+    """Least delay of a signal that is corrected, in its deviations: noise alone makes it in six of
+    ten million cases."""
     min_delay_samples: int = 100
     """Least number of samples for a delay, 1."""
 
@@ -406,9 +407,11 @@ class AnchorRules(NamedTuple):
     gain: float = 0.3
     """Gain of the filtered innovation, 1."""
     small_lsb: float = 1.3
-    """Filtered innovation beyond which the model is re-anchored, LSB."""
+    """Filtered innovation beyond which the model is re-anchored, LSB: 5.4 deviations of the
+    filtered noise (`noise_lsb` by the root of gain / (2 - gain))."""
     large_lsb: float = 6.0
-    """Single innovation beyond which the model is re-anchored, LSB."""
+    """Single innovation beyond which the model is re-anchored, LSB: 10 deviations of the noise,
+    `noise_lsb`."""
 
 
 ANCHORING = AnchorRules()
