@@ -522,7 +522,7 @@ def objections_to_travel(samples: Samples, test: StoredTest, actuator: Actuator)
         for item in channel_relations(samples, actuator)
     )
     sensor = "position" if spool_follows else "spool"
-    if correlation < READINGS.max_reversed_travel_correlation:
+    if correlation < -READINGS.min_travel_correlation:
         return [f"the {sensor} sensor reads with the wrong sign"]
     what = (
         "the position does not follow the flow that the spool lets through: jack seized or at its "

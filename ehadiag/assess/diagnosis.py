@@ -186,7 +186,7 @@ class DiagnosisSession:
             return
         experiment = build_experiment(samples, recording.environment, test, self._actuator)
         for values in (experiment.spool, experiment.pressure):
-            if np.isfinite(values).mean() < RECORDING.min_sample_share_early:
+            if np.isfinite(values).mean() < 1.0 - RECORDING.max_missing_share:
                 return
         self._session.feed([experiment])
 

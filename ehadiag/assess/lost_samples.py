@@ -78,19 +78,19 @@ class ReconstructionRules(msgspec.Struct, frozen=True):
     response_ticks: int = 30
     """Ticks in which a wrong current shows, 1."""
     spacing_per_run: int = 40
-    """Least spacing of two changes tried in one run of the model, ticks."""
+    """Least spacing of two changes tried in one run of the model, ticks: longer than
+    `response_ticks`, in which each shows."""
     spacing_per_sweep: int = 8
     """Least spacing of two changes made at once, ticks."""
     code_offsets: tuple[int, ...] = (0, -1, 1, -2, 2)
-    """Distances of a lost position from a straight line between its neighbours, LSB."""
+    """Distances of a lost position from a straight line between its neighbours, LSB: its noise and
+    rounding are 0.6 LSB."""
     position_variance_lsb2: float = 1.3
     """Variance of that distance by noise, rounding and the straight line, LSB²."""
     max_rows_of_run: int = 3
     """Largest number of rows moved together next to a gap, 1; besides all up to the next gap."""
     max_rows: int = 40
     """Largest number of the latter, 1."""
-    residual_cap: float = 9.0
-    """Largest square of a residual that counts, in variances."""
     current_cap: float = 16.0
     """Largest square of a residual of the current that counts, in variances."""
     current_noise_lsb: float = 0.6
@@ -310,7 +310,7 @@ class _RowReconstruction:
         trace, noise = item.trace, RECONSTRUCTION.current_noise_lsb * item.channels.current.lsb
         current = np.nan_to_num((samples.current - trace.offset - trace.current) / noise)
         return np.asarray(
-            np.minimum(left**2, RECONSTRUCTION.residual_cap).sum(axis=0)
+            np.minimum(left**2, ESTIMATION.residual_cap).sum(axis=0)
             + np.minimum(current**2, RECONSTRUCTION.current_cap)
         )
 

@@ -77,7 +77,7 @@ def effects_of(
                     else None
                 ),
                 limit=limit,
-                beyond=None if chance is None else chance >= VERDICT.min_chance_beyond_limit,
+                beyond=None if chance is None else chance >= VERDICT.min_chance_fault,
                 chance=chance,
                 at_bound=found.at_bound,
                 prior_std=std,
@@ -133,7 +133,7 @@ def notes_on_effects(effects: Sequence[Effect]) -> tuple[str, ...]:
         f"{_size(item)} may be beyond {_limit(item)}: chance {item.chance:.0%}"
         for item in effects
         if item.chance is not None
-        and VERDICT.min_chance_for_note < item.chance < VERDICT.min_chance_beyond_limit
+        and VERDICT.max_chance_false_healthy < item.chance < VERDICT.min_chance_fault
     )
 
 
@@ -149,7 +149,7 @@ def note_on_stand_ins(effects: Sequence[Effect], fit: Fit) -> str:
         if item.name not in PLAYS or item.limit is None:
             continue
         chance = chance_beyond(item.value or 0.0, item.std or 0.0, item.limit)
-        if chance >= VERDICT.min_chance_beyond_limit:
+        if chance >= VERDICT.min_chance_fault:
             return (
                 f"{_size(item)} would be beyond {_limit(item)}, while more than noise is left:"
                 " friction of another law passes for it"

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import ESTIMATION, RESPONSE
+from ehadiag.core.criteria import ESTIMATION, FIT, RESPONSE
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
@@ -54,13 +54,12 @@ class DelayRegression(msgspec.Struct, frozen=True):
     travel_ticks: int = 20
     """Span of the jack's travel, ticks: its position drifts from the model's."""
     max_residual_stds: float = 4.0
-    """Largest residual of the regression, in deviations."""
+    """Largest residual of the regression, in deviations: noise alone exceeds it in six of a hundred
+    thousand samples."""
     corrections: int = 3
     """Largest number of corrections, 1."""
     regressions: int = 5
     """Number of regressions, 1, each without the outliers of the one before."""
-    correlation_ticks: int = 20
-    """Ticks over which the model error is correlated, 1."""
     fit_iterations: int = 8
     """Iterations of the position sensor's robust fit, 1."""
 
@@ -196,7 +195,7 @@ def _delay(name: str, measured: Array, modelled: Array) -> Delay:
         spread = 1.4826 * float(np.nanmedian(np.abs(away)))
         std = spread / float(np.sqrt(power))
         used = np.isfinite(left) & (np.abs(away) <= DELAYS.max_residual_stds * spread)
-    return Delay(name, float(value), std * float(np.sqrt(DELAYS.correlation_ticks)))
+    return Delay(name, float(value), std * float(np.sqrt(ESTIMATION.correlation_lags)))
 
 
 TRAVEL_SPAN_S = 0.1
@@ -277,7 +276,7 @@ def objections_to_position(
     fit: PositionFit, max_gain_error: float = RESPONSE.max_position_gain_error
 ) -> list[str]:
     """Reasons why the position sensor is not trusted; max_gain_error: largest error of its gain."""
-    if fit.gain < RESPONSE.max_reversed_position_gain:
+    if fit.gain < FIT.max_reversed_gain:
         return ["the position sensor reads with the wrong sign"]
     if fit.gain < RESPONSE.min_position_gain:
         return ["the position sensor does not follow the jack: dead, frozen, or another signal"]
@@ -356,7 +355,8 @@ class StepRules(msgspec.Struct, frozen=True):
     """Break-aways of the spool in slow ramps."""
 
     noise_stds: float = 5.0
-    """Least travel in a tick of a break-away, in deviations of the noise of a difference."""
+    """Least travel in a tick of a break-away, in deviations of the noise of a difference, which
+    alone makes it in six of ten million ticks."""
     model_share: float = 0.5
     """The same of the model's, which has no noise, over it, 1."""
     min_count: int = 6

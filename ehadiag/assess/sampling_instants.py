@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
+from ehadiag.core.criteria import ESTIMATION
 from ehadiag.identify.estimates import interval95
 from ehadiag.identify.experiment import Experiment, unknowns_of
 from ehadiag.identify.identification_result import Identification
@@ -44,12 +45,11 @@ class InstantRules(msgspec.Struct, frozen=True):
     the tick of a break-away does."""
     shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1)
     """Shares of a step that are tried until one explains more, 1."""
-    cauchy: float = 3.0
-    """Residual from which Cauchy's cost counts it little, in deviations."""
     settled: float = 1e-4
     """Share of the cost by which a step must lower it to be followed by another, 1."""
     most_stds: float = 4.0
-    """Largest residual that counts, in deviations of all."""
+    """Largest residual that counts, in deviations of all: noise alone exceeds it in six of a
+    hundred thousand samples."""
     fits: int = 6
     """Fits of one step, 1, each without the outliers of the one before."""
     sufficient_share: float = 0.99
@@ -229,7 +229,7 @@ class _Fit(msgspec.Struct, frozen=True, eq=False):
         for away in np.where(lines.breaks, np.nan, self.samples.value - self.model):
             left = away[np.isfinite(away)]
             left = left - np.median(left) if left.size else np.full(1, np.inf)
-            total += float(np.mean(np.log1p(left**2 / INSTANTS.cauchy**2)))
+            total += float(np.mean(np.log1p(left**2 / ESTIMATION.cauchy_scale**2)))
         return total
 
 

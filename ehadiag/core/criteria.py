@@ -29,16 +29,11 @@ class VerdictCriteria(msgspec.Struct, frozen=True):
     limit: float = 0.75
     """Severity from which a unit has a FAULT, 1 (PHY-12)."""
     max_chance_false_healthy: float = 0.025
-    """Largest chance that a severity is at or above the advisory level for HEALTHY, 1: the specific
-    consumer's risk of JCGM 106:2012."""
+    """Largest chance that a severity is at or above the advisory level for HEALTHY, or another
+    fault beyond its limit without a note, 1: the specific consumer's risk of JCGM 106:2012."""
     min_chance_fault: float = 0.5
-    """Least chance that a severity is at or above the limit for FAULT, 1: simple acceptance, JCGM
-    106:2012, 8.2."""
-    min_chance_beyond_limit: float = 0.5
-    """Least chance that another fault is beyond its limit for DEGRADED, 1: simple acceptance."""
-    min_chance_for_note: float = 0.025
-    """Least chance that another fault is beyond its limit for a note, 1: as
-    `max_chance_false_healthy`."""
+    """Least chance that a severity is at or above the limit for FAULT, or another fault beyond its
+    limit for DEGRADED, 1: simple acceptance, JCGM 106:2012, 8.2."""
 
 
 VERDICT = VerdictCriteria()
@@ -48,7 +43,8 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     """Limits of a recording that can be judged."""
 
     max_frame_delay_s: float = 0.05
-    """Longest delay of a frame after its tick, s; a later one counts as lost."""
+    """Longest delay of a frame after its tick, s; a later one counts as lost. Stamps up to that
+    late left a verdict as it was (docs/reference/bus-faults.md)."""
     max_missing_share: float = 0.25
     """Largest share of missing samples of a channel, 1: tried in docs/reference/bus-faults.md."""
     max_missing_share_without_counter: float = 0.4
@@ -57,7 +53,8 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     max_sample_spacing_ticks: int = 2
     """Largest regular spacing of samples, ticks: half the control rate suffices for a diagnosis."""
     max_sample_gap_s: float = 0.25
-    """Longest span without a sample, s."""
+    """Longest span without a sample, s: a diagnosis without 0.2 s of the steps stayed the same
+    (docs/reference/bus-faults.md)."""
     min_command_frames: int = 100
     """Least number of command frames that show the resolution of the command, 1."""
     min_current_share_without_command: float = 0.4
@@ -75,11 +72,10 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     min_supply_pressure_share: float = 0.5
     """Least supply pressure, as a share of that in the actuator file, 1."""
     max_current_residual_stds: float = 2.0
-    """Largest rms residual of the current, in deviations of the noise."""
+    """Largest rms residual of the current, in deviations of the noise: noise alone, whose rms is 1,
+    does not make it."""
     max_control_residual_lsb: float = 4.0
     """Largest rms residual of the current against the control law, LSB."""
-    min_sample_share_early: float = 0.75
-    """Least share of samples for estimating from a test that still runs, 1."""
 
 
 RECORDING = RecordingCriteria()
@@ -89,7 +85,8 @@ class ReadingCriteria(msgspec.Struct, frozen=True):
     """Limits of plausible units, signs, motion and actuator data."""
 
     max_reading_factor: float = 10.0
-    """Largest reading over what the actuator can reach, 1."""
+    """Largest reading over what the actuator can reach, 1: no sensor reads more, whatever is wrong
+    with it."""
     min_channel_correlation: float = 0.8
     """Least correlation of two channels that shows their units, 1."""
     max_channel_ratio_error: float = 0.25
@@ -105,8 +102,6 @@ class ReadingCriteria(msgspec.Struct, frozen=True):
     """Least correlation of the jack's travel with the spool's flow, 1: 0.988 at least on 80 sound
     units with all effects, data 5 % off and orifices, 0.84 with a sensor 50 ms late; 0.33 to -1
     with another signal."""
-    max_reversed_travel_correlation: float = -0.7
-    """Largest correlation of travel and flow of a sensor with the wrong sign, 1."""
     max_actuator_ratio_factor: float = 30.0
     """Largest factor between a ratio of actuator data and its usual value, 1."""
 
@@ -119,7 +114,8 @@ class FitCriteria(msgspec.Struct, frozen=True):
 
     max_outlier_share: float = 0.015
     """Largest share of residuals beyond three deviations for a verdict, 1: five to six times that
-    of noise, `NOISE_OUTLIER_SHARE`."""
+    of noise, `NOISE_OUTLIER_SHARE`. Textbook units had 0.0058 at most (`tools/study cube`), with
+    1 % of hysteresis more than 0.02 (ADR 4 at 4fd82576)."""
     max_rms: float = 1.25
     """Largest rms residual for a verdict, in deviations of the noise."""
     outlier_factor_further_effects: float = 6.0
@@ -137,7 +133,8 @@ class FitCriteria(msgspec.Struct, frozen=True):
     """Mean of Cauchy's cost that an excess is over, 1. A standard normal residual has 0.874, 1.4 %
     more; the limits of excess on this page were set with this value."""
     max_outliers_of_noise: float = 0.01
-    """Largest share of residuals beyond three deviations where nothing is left to explain, 1."""
+    """Largest share of residuals beyond three deviations where nothing is left to explain, and no
+    further unknowns are needed, 1."""
     max_explained_excess: float = 1.25
     """Largest excess of an explained signal, 1: 1.02 to 1.15 at the optimum of 80 simulated
     tests."""
@@ -148,8 +145,6 @@ class FitCriteria(msgspec.Struct, frozen=True):
     """Largest standard deviation of a severity that the test shows, 1."""
     bound_tolerance: float = 1e-6
     """Distance of a severity from its bound at which it is on it, 1."""
-    max_fit_outliers: float = 0.01
-    """Largest share of residuals beyond three deviations that needs no further unknowns, 1."""
     max_start_outliers: float = 0.15
     """Largest share of outliers of a start for the severities alone, 1: mostly 0.04 at most on a
     textbook's actuator, 0.29 and more on others; between break-aways a search may end away from the
@@ -219,23 +214,23 @@ class GiveUpCriteria(msgspec.Struct, frozen=True):
     min_other_end_gain: float = 30.0
     """Least gain in objective of another place, 1."""
     max_trial_share: float = 0.5
-    """Largest share of the excess over noise that an effect leaves on trial, 1: loads of 20 to 80 N
-    left 1.1 of 1.3 to 2.0, broken hardware as much as before."""
+    """Largest share of the excess over noise that an effect on trial, effects that have changed
+    since a calibration, or another exponent leave, 1: loads of 20 to 80 N left 1.1 of 1.3 to 2.0,
+    broken hardware as much as before."""
     max_load_trial_excess: float = 15.0
     """Largest excess after all nuisances for which a load is tried, 1."""
     max_unchanged_excess: float = 1.3
     """Largest excess by a calibration's prior of an unchanged unit, 1: wear shows what its model
     leaves out, which loosened effects would replace."""
-    max_changed_share: float = 0.5
-    """Largest share of the excess over noise that may remain where effects have changed since,
-    1."""
     min_unambiguous_hysteresis: float = 5e-3
     """Full relative width of hysteresis below which closed loop keeps the spool breaking away,
     1."""
     max_last_part_step: float = 3.0
-    """Longest step by the last part of a test, in deviations of the first part."""
+    """Longest step by the last part of a test, in deviations of the first part: a longer one is
+    none of a small part, and the whole is refined (ADR 5)."""
     max_severity_step: float = 1.0
-    """The same of a severity, in its deviations; beyond, the whole test is refined."""
+    """The same of a severity, in its deviations: beyond, one step does not lead to the optimum of
+    the whole test."""
     max_cost_rise: float = 4.0
     """Largest rise of the cost by that step, 1: what break-aways make of a descent."""
 
@@ -254,8 +249,6 @@ class ResponseCriteria(msgspec.Struct, frozen=True):
     """Least rms travel over the span for a gain, LSB."""
     min_position_gain: float = 0.2
     """Least gain of a position sensor that follows the jack, 1."""
-    max_reversed_position_gain: float = -0.5
-    """Largest gain of a position sensor with the wrong sign, 1."""
     max_position_gain_error: float = 0.1
     """Largest error of the position sensor's gain, 1: twice that of flow gain and jack area 5 %
     off."""
@@ -284,7 +277,8 @@ class ResponseCriteria(msgspec.Struct, frozen=True):
     min_delay_ticks: float = 0.05
     """Least delay of a signal that is corrected, ticks."""
     min_delay_stds: float = 5.0
-    """Least delay of a signal that is corrected, in its deviations."""
+    """Least delay of a signal that is corrected, in its deviations: noise alone makes it in six of
+    ten million cases."""
     min_delay_samples: int = 100
     """Least number of samples for a delay, 1."""
 
@@ -347,12 +341,14 @@ class EstimationRules(NamedTuple):
     """Mean absolute value of a standard normal variable without its largest 2 %, 1."""
     min_rest_samples: int = 20
     """Least number of samples at rest from which an offset is taken, 1."""
-    residual_cap: float = 9.0
-    """Largest square of one weighted residual that counts, in variances."""
     cauchy_scale: float = 3.0
-    """Scale of Cauchy's cost, in deviations: larger residuals count little."""
+    """Scale of Cauchy's cost, in deviations: larger residuals count little. Noise alone has 0.3 %
+    of them, `NOISE_OUTLIER_SHARE`."""
+    residual_cap: float = cauchy_scale**2
+    """Largest square of one weighted residual that counts, in variances: of `cauchy_scale`."""
     max_row_scatter: float = 1.0
-    """Scatter about the linear model from which a sample is left out, in variances."""
+    """Scatter about the linear model from which a sample is left out, in variances: as large as the
+    noise, it tells nothing."""
     max_informative_scatter: float = 0.03
     """The same, for how sure an optimum is: that of a jump by 0.6 deviations, twice what is taken
     for a break-away between two-sided differences; 0.02 on a cross, 0.033 in a regression."""
@@ -362,12 +358,13 @@ class EstimationRules(NamedTuple):
     """Relative change of the noise up to which the refinement is not repeated, 1."""
     correlation_lags: int = 20
     """Ticks over which residuals are correlated, 1."""
-    capped_variance: float = _capped_variance(3.0)
+    capped_variance: float = _capped_variance(cauchy_scale)
     """Mean square of a standard normal variable without its values beyond `cauchy_scale`, 1."""
     refined_std: float = 3e-4
     """Standard deviation of a severity about a refined optimum, 1."""
     discrepancy_std: float = 3e-5
-    """Standard deviation of a severity between different integrations of a plant, 1."""
+    """Standard deviation of a severity between different integrations of a plant, 1: what estimates
+    differ by beyond the noise (ADR 4)."""
     uniform_std: float = 1.0 / math.sqrt(12.0)
     """Standard deviation of a severity that is uniform on 0 … 1, 1."""
     sampling_lead_std: float = 0.15e-6
@@ -386,7 +383,8 @@ class RefinementRules(NamedTuple):
     min_bound_distance: float = 0.25
     """Share of that distance to a bound below which the points lie on its other side, 1."""
     min_linear_ratio: float = 0.05
-    """Least ratio of widths in a round where the model is linear over the density, 1."""
+    """Least ratio of widths in a round where the model is linear over the density, 1: there is no
+    break-away to look past."""
     max_linear_scatter: float = 0.1
     """Scatter of a sample up to which the model is linear, in variances."""
     max_nonlinear_share: float = 0.01
@@ -409,9 +407,11 @@ class AnchorRules(NamedTuple):
     gain: float = 0.3
     """Gain of the filtered innovation, 1."""
     small_lsb: float = 1.3
-    """Filtered innovation beyond which the model is re-anchored, LSB."""
+    """Filtered innovation beyond which the model is re-anchored, LSB: 5.4 deviations of the
+    filtered noise (`noise_lsb` by the root of gain / (2 - gain))."""
     large_lsb: float = 6.0
-    """Single innovation beyond which the model is re-anchored, LSB."""
+    """Single innovation beyond which the model is re-anchored, LSB: 10 deviations of the noise,
+    `noise_lsb`."""
 
 
 ANCHORING = AnchorRules()

@@ -199,7 +199,7 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         most_outliers=FIT.max_outliers_of_noise if exact else outliers,
         most_rms=rms,
         most_excess=FIT.max_excess_without_nuisances if exact and calibration is None else math.inf,
-        search_outliers=max(FIT.max_fit_outliers, outliers - FIT.max_outlier_share),
+        search_outliers=max(FIT.max_outliers_of_noise, outliers - FIT.max_outlier_share),
         most_anchored=float(FIT.max_anchor_count),
         most_std=FIT.max_shown_std,
         most_lost=RECORDING.max_missing_share,

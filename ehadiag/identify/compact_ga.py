@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array, Array2, bare_kernel, kernel
 
 ELITE_PULL = 0.5
-"""Share of its distance from the elite by which the mean moves after a generation."""
+"""Share of its distance from the elite by which the mean moves after a generation, 1: the vector
+would else collapse away from the optimum while the elite moves on."""
 MIN_SPREAD_STEPS = 1.5
-"""Least deviation after a generation, in steps of the elite."""
+"""Least deviation after a generation, in steps of the elite, for the same reason."""
 
 
 class CompactGaState(NamedTuple):

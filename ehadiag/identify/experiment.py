@@ -418,7 +418,7 @@ def _mean_of_motion(pressure: Array, test: StoredTest) -> float:
         inside |= (begin < time) & (time <= end)
     seen = pressure[inside & np.isfinite(pressure)]
     needed = sum(end - begin for begin, end in test.windows.refinement) * test.rate
-    return float(seen.mean()) if seen.size > RECORDING.min_sample_share_early * needed else 0.0
+    return float(seen.mean()) if seen.size > (1.0 - RECORDING.max_missing_share) * needed else 0.0
 
 
 def _slides(position: Array, channel: Channel) -> bool:
@@ -479,6 +479,8 @@ WindowSpans = Sequence[Sequence[TimeWindow]]
 """Of each test, s."""
 ANCHOR_THRESHOLDS_LSB = (ANCHORING.small_lsb, ANCHORING.large_lsb)
 EVEN_JACK_LEVEL = 2
+"""Halvings of the jack's ticks in few runs, 1: to find how each is to be cut takes as long as a
+generation of the genetic search (ADR 13 at 76e9001c)."""
 JACK_ANCHOR_SHARE = 0.01
 """Share of the jack's innovation by which the model is moved each tick: what lasts longer than a
 tenth of a second is taken away from the residual."""

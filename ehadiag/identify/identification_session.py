@@ -503,7 +503,7 @@ def _severities_suffice(refinement: Refinement) -> bool:
     """Whether the severities alone explain a recording, without slow residuals, of which
     small nuisances would be the cause."""
     return (
-        refinement_outlier_share(refinement) <= FIT.max_fit_outliers
+        refinement_outlier_share(refinement) <= FIT.max_outliers_of_noise
         and excess_cost(refinement.residuals) <= FIT.max_excess_without_nuisances
     )
 

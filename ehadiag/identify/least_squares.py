@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.identify.linearisation import (
     CoordinateCross,
     Derivatives,
@@ -204,10 +204,6 @@ def median_offsets(model: ResidualModel, residuals: Array) -> dict[str, float]:
     return out
 
 
-MIN_LAST_ROUND_INFORMATION = 1e-9
-"""Information on what no sample shows, in units of the scales."""
-
-
 LAST_ROUND_WEIGHINGS = 3
 """Weighings of a last round, 1: oil half a step colder than the bus says shifts many residuals."""
 
@@ -352,7 +348,7 @@ def _last_round_step(
     count, shape = len(linear.x), pulls.shape
     rows = np.concatenate([linear.jacobian, daily]).reshape(count + len(daily), -1)
     prior = np.eye(len(rows))
-    prior[:count, :count] = MIN_LAST_ROUND_INFORMATION * np.eye(count)
+    prior[:count, :count] = REFINEMENT.min_information * np.eye(count)
     if information is not None:
         prior[:count, :count] += information
     free = np.full(len(daily), np.inf)

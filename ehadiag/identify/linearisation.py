@@ -251,7 +251,7 @@ def capped_cost(residuals: Array) -> float:
 
 
 RUN_BLOCK_SIZE = 16
-"""Runs come in blocks of that size."""
+"""Candidates that a kernel runs side by side, 1 (ADR 22): runs come in blocks of that size."""
 MIN_SINGULAR_RATIO = 1e-6
 """Singular value, over the largest, below which a direction is not seen."""
 

@@ -36,6 +36,7 @@ from ehadiag.identify.experiment import (
 )
 from ehadiag.identify.least_squares import Refinement, refined_with_day, refinement_at
 from ehadiag.identify.linearisation import (
+    RUN_BLOCK_SIZE,
     ConsideredParameter,
     Derivatives,
     ParameterDensity,
@@ -43,6 +44,7 @@ from ehadiag.identify.linearisation import (
 )
 from ehadiag.identify.nuisance_search import (
     NUISANCE_RUN_BUDGET,
+    RESTARTS,
     MultistartResult,
     NuisanceSearchSettings,
     StagedSearchResult,
@@ -70,11 +72,9 @@ from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
 from ehadiag.model.severities import FAULT_LAWS
 
-FINAL_SPREAD_RATIO = 3.0
-"""Spread of the last look, with the noise as judged, in spreads of the search's end."""
 HYSTERESIS_NAME = "hysteresis"
 AMBIGUOUS_STDS = {name: law.ambiguous_std for name, law in FAULT_LAWS.items()}
-PROFILE_HALF_WIDTH = 15
+PROFILE_HALF_WIDTH = RUN_BLOCK_SIZE - 1
 """Half width of the likelihood profile along a valley, deviations: two blocks of runs."""
 
 
@@ -195,9 +195,9 @@ def estimate_about(
                 density = _search_about(
                     fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain
                 )
-            density = _search_about(fine, search, density, FINAL_SPREAD_RATIO * density.root)
+            density = _search_about(fine, search, density, RESTARTS.end_spread * density.root)
         else:
-            late, begin = fine, replace(density, root=FINAL_SPREAD_RATIO * density.root)
+            late, begin = fine, replace(density, root=RESTARTS.end_spread * density.root)
             whole = [a.with_noise(b.noise) for a, b in zip(experiments, judged, strict=True)]
             for items in (whole, judged) if any(item.creep_end for item in judged) else (judged,):
                 evaluations += fine.evaluations

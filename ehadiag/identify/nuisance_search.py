@@ -60,11 +60,13 @@ class RestartRules(msgspec.Struct, frozen=True):
     """Restarts of a search."""
 
     spread_share: float = 0.1
-    """Spread about the best end so far, in spreads of the first."""
+    """Spread about the best end so far, in spreads of the first: so wide a search found an optimum
+    beyond one break-away (one unit had been 17 deviations off), and one about the end left 1 of 40
+    units beside the optimum, not 13 (ADR 23)."""
     end_spread: float = 3.0
-    """Spread of a look about an end that misses only the pressure, in spreads of that end: with
-    such looks 1 of 40 units ended beside the optimum, 13 without (ADR 23); other spreads were not
-    recorded."""
+    """Spread of a look about an end that misses only the pressure, and of the last one with the
+    noise as judged, in spreads of that end: with looks of the first kind 1 of 40 units ended beside
+    the optimum, 13 without (ADR 23); other spreads were not recorded."""
     alias_half_span: float = 1.25
     """Half-width over which a parameter is moved against its alias, in units of its scale."""
     alias_points: int = 128
@@ -94,7 +96,7 @@ class RestartRules(msgspec.Struct, frozen=True):
 RESTARTS = RestartRules()
 
 NUISANCE_RUN_BUDGET = 1600
-"""Runs of the model after which no further start is made, 1."""
+"""Runs of the model after which no further start is made, 1: a start takes some 200 to 700."""
 
 
 class StartEnd(msgspec.Struct, frozen=True, eq=False):

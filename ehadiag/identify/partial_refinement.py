@@ -291,7 +291,8 @@ def _with_judged_noise(
 
 
 LAST_PART_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, most_rounds=4, whole_rounds=2)
-"""Rounds of the whole where it is refined: the test is over by then, and the verdict awaited."""
+"""Rounds of the whole where it is refined, four at most: the test is over by then, and the verdict
+awaited; to refine the whole from the start brought nothing (ADR 13 at 76e9001c)."""
 
 
 def add_last_part(

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, GIVE_UP, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
 
 MIN_GRADIENT_SHARE = 1e-9
@@ -90,9 +90,11 @@ class SearchSchedule(msgspec.Struct, frozen=True):
 
 
 MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
-    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000, flat=10.0
-)
-"""Schedule for many unknowns."""
+    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000,
+    flat=GIVE_UP.same_end_cost,
+)  # fmt: skip
+"""Schedule for many unknowns, fast: with a half as least ratio 9 of 54 hard starts came to the
+optimum, in 360 runs each, and slow ones follow where it does not (ADR 8)."""
 SLOW_SCHEDULE = replace(
     MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, whole_rounds=70, width=3.0
 )
@@ -106,7 +108,9 @@ BRIEF_SCHEDULE = replace(FINAL_SCHEDULE, most_rounds=6)
 FEW_UNKNOWNS_SCHEDULE = SearchSchedule(
     0.2, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0
 )
-"""Schedule for few unknowns: until the estimate is independent of the search before."""
+"""Schedule for few unknowns: until the estimate is independent of the search before. With eight
+rounds, averaged from the sixth on, of estimates by other seeds 85 % were within 0.1 deviations in
+closed loop, not 90; with fewer the mean error grew by 5 % (ADR 13 at 76e9001c)."""
 
 
 class PosteriorResult(msgspec.Struct, frozen=True, eq=False):

@@ -80,10 +80,6 @@ class CommandRules(msgspec.Struct, frozen=True):
 
     min_misfit_gain: float = 30.0
     """Least gain in the sum of squares of a rounding over none, in variances."""
-    max_misfit: float = 3.0
-    """Largest residual that counts, in deviations."""
-    min_levels: int = 100
-    """Least number of values sent that show their resolution, 1."""
     max_guessed_ticks: int = 50
     """Largest number of ticks of a hole that count as guessed, 1: in a longer one there is no
     sample either that a wrong current could affect. An integral in the control law keeps all of
@@ -120,7 +116,8 @@ def resolution_by_current(
         return 0.0
 
     def misfit(away: Array) -> float:
-        return float(np.sum(np.clip(away / scale, -COMMANDS.max_misfit, COMMANDS.max_misfit) ** 2))
+        largest = ESTIMATION.cauchy_scale
+        return float(np.sum(np.clip(away / scale, -largest, largest) ** 2))
 
     steps = np.concatenate([COMMAND_RESOLUTIONS, converter * CODE_RESOLUTION_RATIOS])
     found = [misfit(residual(np.round(stored / step) * step)) for step in steps]
@@ -272,7 +269,7 @@ def _fit_length(command: Array, n: int) -> Array:
 def _resolution(sent: Array) -> float:
     """Smallest distance between two values sent; 0 of too few."""
     levels = np.unique(sent)
-    return 0.0 if levels.size < COMMANDS.min_levels else float(np.diff(levels).min())
+    return 0.0 if levels.size < RECORDING.min_command_frames else float(np.diff(levels).min())
 
 
 def _as_sent(stored: Array, resolution: float) -> Array:

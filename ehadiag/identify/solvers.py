@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.identify import compact_ga
+from ehadiag.identify.linearisation import RUN_BLOCK_SIZE
 from ehadiag.model.registry import ResidualModel
 from firmware_iface.errors import ConfigurationError
 
@@ -101,8 +102,8 @@ class CompactGa(msgspec.Struct, frozen=True):
     budget: int = 600
     """Evaluations at most."""
     virtual_population: float = 42.0
-    samples: int = 16
-    """Individuals drawn a generation."""
+    samples: int = RUN_BLOCK_SIZE
+    """Individuals drawn a generation: a block of runs."""
     tolerance: float = 1e-6
     """Done when the deviation of every gene is below."""
     name: ClassVar[str] = "cga"
@@ -160,7 +161,7 @@ class PygadGa(msgspec.Struct, frozen=True):
     """
 
     budget: int = 1600
-    population: int = 16
+    population: int = RUN_BLOCK_SIZE
     finest: float = 5e-6
     """Range of the mutation in the last generation."""
     name: ClassVar[str] = "pygad"

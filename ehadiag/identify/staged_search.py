@@ -23,7 +23,8 @@ from ehadiag.identify.experiment import (
     lay_out_spans,
     unknowns_of,
 )
-from ehadiag.identify.solvers import Objective, SearchResult, Solver
+from ehadiag.identify.linearisation import RUN_BLOCK_SIZE
+from ehadiag.identify.solvers import SEARCH_CAP, Objective, SearchResult, Solver
 from ehadiag.model.batch import Batch
 from ehadiag.model.registry import FAULTS, Unknowns
 from ehadiag.model.residual_models import SimdModel
@@ -35,30 +36,31 @@ from firmware_iface.stored_test import StoredTest, TimeWindow
 class StageRules(NamedTuple):
     """Grids and stages of the global search."""
 
-    coarse_points: int = 32
-    """Points of the coarse search over 0 … 1."""
+    coarse_points: int = 2 * RUN_BLOCK_SIZE
+    """Points of the coarse search over 0 … 1: two blocks of runs."""
     repeated_ranges: tuple[tuple[float, float], ...] = ((0.2, 0.06), (0.05, 0.02))
     """Half-widths of the repeated searches in the slewing and the creeping spool, 1."""
-    fine_points: int = 16
-    """Points of a finer grid, 1."""
+    fine_points: int = RUN_BLOCK_SIZE
+    """Points of a finer grid, 1: a block of runs."""
     finest_spacing: float = 6e-4
     """Spacing of the last grid, 1."""
     creep_spacings: tuple[float, ...] = (0.04, 0.01, 6e-4)
     """Spacing of the last grid of the three searches in the creeping spool, 1, whose runs cost
-    most."""
+    most: the refinement looks 0.0004 to 0.002 to either side (ADR 11 at c48f0620)."""
     jack_spacing: float = 4.5e-3
     """Spacing of the last grid in the driven jack, 1, whose cost is nearly a parabola."""
     jack_sweeps: int = 3
     """Sweeps over the severities that the driven jack shows, 1, where there are several."""
     first_run_in_s: float = 0.05
     """Run-in of the first approximation, s."""
-    pressure_cap: float = 25.0
-    """Largest square of a residual of the pressure, in variances."""
+    pressure_cap: float = SEARCH_CAP
+    """Largest square of a residual of the pressure, in variances, as in the genetic search."""
     spool_cap: float = 100.0
     """Largest square of a residual of the spool, in variances: a stick-slip jump at another tick
     counts no more than ten times the noise."""
     budget_share: float = 1.0 / 12.0
-    """Budgets of the solver for all stages together, 1."""
+    """Budgets of the solver for all stages together, 1: two generations of half a block a stage
+    guard against a wrong basin; accuracy does not need them (ADR 4)."""
     first_deviation: float = 0.004
     """Standard deviation of the first stage about the first approximation, severities."""
     narrowing: float = 0.5
