@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import BREAK_AWAYS, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.estimates import (
     estimate_covariance,
     excess_cost,
@@ -78,20 +78,6 @@ PROFILE_HALF_WIDTH = RUN_BLOCK_SIZE - 1
 """Half width of the likelihood profile along a valley, deviations: two blocks of runs."""
 
 
-class BreakAwayRules(msgspec.Struct, frozen=True):
-    """Break-aways at wrong ticks."""
-
-    block: int = 25
-    """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
-    event_cost: float = 30.0
-    """Least cost of a block, beyond the usual one, with such a break-away."""
-    max_end_cost: float = 2.0
-    """Cost of an end of a search, noise included, over the best one's, 1, up to which it differs by
-    break-aways: of a unit with 0.08 % of hysteresis four of five ends cost 1.2 to 1.4 times as
-    much, and `FDJ` was 5 deviations off without them."""
-
-
-BREAK_AWAYS = BreakAwayRules()
 PosteriorSearch = Callable[..., PosteriorResult]
 """`search_posterior` with all but where it begins."""
 

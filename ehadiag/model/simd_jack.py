@@ -58,6 +58,7 @@ from ehadiag.model.sensors import (
 from ehadiag.model.simd_jack_pieces import (
     jack_events,
     jack_over_pieces,
+    jacks,
     linear_step_events,
     orifice_events,
 )
@@ -220,14 +221,7 @@ def _jack_tick(senses: bool) -> Any:
         h = tick / (1 << level)
         for o in range(0, end, VECTOR_WIDTH):
             j = jack_laws(coefficients, o)
-            place, velocity = (
-                load(state, ROWS.jack * LANES + o),
-                load(state, ROWS.jack_velocity * LANES + o),
-            )
-            d, fresh = (
-                load(state, ROWS.jack_direction * LANES + o),
-                load(state, ROWS.fresh * LANES + o),
-            )
+            place, velocity, d, fresh = jacks(state, o)
             done = load(state, ROWS.done * LANES + o) != 0.0
             # From step to step in registers: what is stored in part cannot be loaded at once.
             for step in range(1 << level):
@@ -268,13 +262,13 @@ def _jack_tick(senses: bool) -> Any:
                         force + d * j.friction,
                     )
                     later = radau_velocity(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
-                    if senses:
+                    if creeps:
+                        p1, p2, p3 = radau_creep_pressures(
+                            j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
+                        )
+                        later = where(j.extra > 0.0, j.flow * x3 - e3 * p3, later)
+                    elif senses:
                         p1, p2, p3 = radau_pressures(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
-                        if creeps:
-                            p1, p2, p3 = radau_creep_pressures(
-                                j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
-                            )
-                            later = where(j.extra > 0.0, j.flow * x3 - e3 * p3, later)
                     moved = place + 0.5 * h * (velocity + later)
                     slides = (later * d > 0.0) & (absolute(moved) < j.stroke)
                     # What the collocation does not follow: a fresh start, a fast way past the
@@ -318,14 +312,7 @@ def _jack_tick(senses: bool) -> Any:
                         events = events & plain
                     if any_lane(events):
                         linear_step_events(o, level, step, tick, events, state, path, coefficients)
-                    place, velocity = (
-                        load(state, ROWS.jack * LANES + o),
-                        load(state, ROWS.jack_velocity * LANES + o),
-                    )
-                    d, fresh = (
-                        load(state, ROWS.jack_direction * LANES + o),
-                        load(state, ROWS.fresh * LANES + o),
-                    )
+                    place, velocity, d, fresh = jacks(state, o)
             store(state, ROWS.jack * LANES + o, place)
             store(state, ROWS.jack_velocity * LANES + o, velocity)
 

@@ -83,6 +83,17 @@ def keep_lane_jack(jack: JackState, state: Array, i: int) -> None:
     state[ROWS.pressure_sampled * LANES + i] = jack.seen
 
 
+@packed
+def jacks(state: Array, o: int) -> tuple[Vector, Vector, Vector, Vector]:
+    """Place, velocity, direction, and whether it has just started or stopped, lanes from `o`."""
+    return (
+        load(state, ROWS.jack * LANES + o),
+        load(state, ROWS.jack_velocity * LANES + o),
+        load(state, ROWS.jack_direction * LANES + o),
+        load(state, ROWS.fresh * LANES + o),
+    )
+
+
 @bare_kernel
 def jack_events(
     begin_lane: int, end_lane: int, level: int, step: int, tick: float,
@@ -342,11 +353,7 @@ def linear_events(
     """
     j, goes = jack_laws(coefficients, o), these != 0.0
     mine = goes
-    place, velocity = (
-        load(state, ROWS.jack * LANES + o),
-        load(state, ROWS.jack_velocity * LANES + o),
-    )
-    d, fresh = load(state, ROWS.jack_direction * LANES + o), load(state, ROWS.fresh * LANES + o)
+    place, velocity, d, fresh = jacks(state, o)
     zero = d * 0.0
     one = zero + 1.0
     piece = PathPiece(where(mine, span, 1.0), x0, x1, rise0, rise1)

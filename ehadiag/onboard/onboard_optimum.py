@@ -11,9 +11,8 @@ from ehadiag.compile.elementary import exponential, logarithm, normal_cdf
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import BREAK_AWAYS, ESTIMATION, FIT, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.linearisation import DIFFERENCES
-from ehadiag.identify.nuisance_estimate import BREAK_AWAYS
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.severities import FAULT_CHANGES, FAULT_LAWS
 from ehadiag.model.simd_layout import ROWS
