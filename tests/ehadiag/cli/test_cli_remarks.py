@@ -93,7 +93,7 @@ def test_a_log_without_environment_says_so_in_text_and_json(run: Run, tmp_path: 
     ("first", "last", "words"),
     [
         (0, 5300, "the last 0.200 s of the test are missing: the recording ends early"),
-        (0, 5490, "the last 0.010 s of the test are missing: the recording ends early"),
+        (0, 5450, "the last 0.050 s of the test are missing: the recording ends early"),
         (120, 5500, "the first 0.120 s of the test are missing"),
     ],
 )
