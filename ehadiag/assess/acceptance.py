@@ -190,7 +190,7 @@ def objections_to_environment(environment: Environment, actuator: Actuator) -> l
     if environment.supply_pressure is not None and environment.return_pressure is not None:
         supply = environment.supply_pressure - environment.return_pressure
         usual = actuator.servovalve.PSR
-        least = RECORDING.min_supply_pressure_share
+        least = READINGS.min_supply_pressure_share
         if not least * usual <= supply <= READINGS.max_reading_factor * usual:
             out.append(
                 f"supply {supply / 1e6:.1f} MPa above return, "

@@ -553,7 +553,8 @@ def _notes_on_effects(identification: Identification | None, actuator: Actuator)
             f"{with_unit(identification.nuisances[name].value, parameter(name).unit)} now"
             for name, value in calibration.effects.items()
             if name in identification.nuisances
-            and abs(identification.nuisances[name].value - value) > noise_limit() * stds[name]
+            and abs(identification.nuisances[name].value - value)
+            > max(noise_limit() * stds[name], parameter(name).scale)
         ]
     learned = (*learned, *DAILY_PRIORS)
     words = [parameter(name).short for name in identification.freed if name not in learned]

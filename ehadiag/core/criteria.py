@@ -78,8 +78,6 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     oil_temperature_range_degc: tuple[float, float] = (-54.0, 135.0)
     """Range of oil temperatures in which the oil's law is used, degC: from MIL-PRF-83282's lowest
     to the usual limit of seals."""
-    min_supply_pressure_share: float = 0.5
-    """Least supply pressure, as a share of that in the actuator file, 1."""
     max_control_residual_lsb: float = 4.0
     """Largest rms residual of the current against the control law, LSB: seven times the noise of
     a 12-bit channel; of noisier converters as many times theirs."""
@@ -102,6 +100,9 @@ class ReadingCriteria(msgspec.Struct, frozen=True):
     """Largest relative error of the ratio of two channels by faults, load and supply, 1; also of
     the position sensor's gain on a unit calibrated with effects of its own, whose flow gain and
     jack area may replace what the model leaves out."""
+    min_supply_pressure_share: float = (1.0 - max_channel_ratio_error) ** 2
+    """Least supply pressure, as a share of that in the actuator file, 1: flow gain, which is stated
+    for that, goes with its root."""
     max_actuator_ratio_factor: float = math.sqrt(1000.0)
     """Largest factor between a ratio of actuator data and that of the reference actuator, 1: half
     of a prefix of units, in the logarithm."""
@@ -155,9 +156,11 @@ class FitCriteria(msgspec.Struct, frozen=True):
     """Largest excess that needs no nuisances, 1: 1.15 at most in 80 recordings of units without
     any."""
     min_suspect_share: float = 0.1
-    """Least share of the unexplained cost that a suspect would explain, 1."""
+    """Least share of the unexplained cost that a suspect would explain, 1; also what is left out at
+    either end of the time that is named."""
     min_advice_share: float = 0.6
-    """Least share of the unexplained cost that a suspect explains to be named the cause, 1."""
+    """Least share of the unexplained cost that a suspect explains to be named the cause, 1: gain of
+    the spool sensor explained 0.53 to 0.58 of another valve."""
 
 
 FIT = FitCriteria()
@@ -242,16 +245,20 @@ class ResponseCriteria(msgspec.Struct, frozen=True):
     """Limits of position sensor, supply, delays and still signals against the response."""
 
     travel_span_s: float = 0.1
-    """Span over which travels of the jack are compared, s."""
+    """Span over which travels of the jack are compared, s: velocities of the stored tests, of
+    1 to 10 mm/s in ramps, make three steps of the converter or more of it."""
     max_still_lsb: float = 4.0
-    """Largest range of a signal that stands still, LSB: that of the noise of 5000 samples."""
+    """Largest range of a signal that stands still, LSB: 7 deviations of the noise, `noise_lsb`,
+    which is the mean range of 2500 samples of noise."""
     min_gain: float = 0.5
-    """Least gain of a signal that follows the model, 1; below minus that its sign is wrong."""
+    """Least gain of a signal that follows the model, 1; below minus that its sign is wrong: nearer
+    to 1 or -1 than to none."""
     max_position_gain_error: float = 0.1
     """Largest error of the position sensor's gain, 1: twice that of flow gain and jack area 5 %
     off."""
     max_travel_rms: float = 4.0
-    """Largest rms residual of the travel, in deviations of its noise: 1.0 to 2.5 on sound units."""
+    """Largest rms residual of the travel, in deviations of its noise: 1.0 to 2.5 on sound units;
+    three times as far a travel is an outlier."""
     min_pressure_excess_share: float = 0.12
     """Least excess of the modelled over the largest measured pressure, as a share of it, 1: a sound
     unit with another law of friction had 10 % for two ticks. Farther below its largest value than
