@@ -77,8 +77,8 @@ def _widened_estimate(item: Estimate, hidden: Sequence[str]) -> Estimate:
 
 
 RESPONSE_TICKS = 30
-"""Ticks in which a wrong current shows, 1: changes tried in one run of the model, or made at once,
-are so far apart; more rows at once are not moved."""
+"""Ticks in which a wrong current shows, 1, some periods of first stage and spool: changes tried in
+one run of the model, or made at once, are so far apart; more rows at once are not moved."""
 POSITION_VARIANCE = 1.5 * ESTIMATION.noise_lsb**2
 """Variance of a position about a straight line between its neighbours by their noise, LSB²."""
 CODE_OFFSETS = range(

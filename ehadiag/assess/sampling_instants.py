@@ -27,10 +27,11 @@ from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import SAMPLING, Acquisition, Recording, sampling_interval, values_at
 
 SEVERITY_STEP = 5e-4
-"""Difference of a severity for its derivative, 1."""
+"""Difference of a severity for its derivative, 1: a few deviations of one, so that the model bends
+by less than `MAX_BENT` between break-aways."""
 MAX_BENT = 0.5
-"""Most by which the model may leave a line within such differences, in deviations of the noise: the
-tick of a break-away does."""
+"""Most by which the model may leave a line within such differences, in deviations of the noise,
+which then is more than that: the tick of a break-away does."""
 PARTS = 16
 """Parts of a tick that the model runs through one by one, 1: a cubic lies through the ends of four
 of them, and behind a step of the current the flapper takes a fifth of a tick."""

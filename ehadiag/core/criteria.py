@@ -266,7 +266,7 @@ class ResponseCriteria(msgspec.Struct, frozen=True):
     2 to 4 % lower, the swing of a sound unit 18 %."""
     whole_tick: float = 0.15
     """Distance from a whole number of ticks up to which a delay is one, ticks: of frames it always
-    is."""
+    is. A smaller delay is none."""
 
 
 RESPONSE = ResponseCriteria()
@@ -281,7 +281,7 @@ class LossCriteria(msgspec.Struct, frozen=True):
     actuator can reach. As many residuals may be outliers (docs/reference/bus-faults.md)."""
     max_guessed_share: float = 0.13
     """Largest share of guessed currents that is reconstructed, or with which jack friction is
-    estimated, 1: tried so far."""
+    estimated, 1: jack friction was tried up to it, and off by 0.001 at most."""
     min_outlier_share_misplaced: float = 2.0 * NOISE_OUTLIER_SHARE
     """Least share of outliers from which rows placed by time may be misplaced, 1: twice that of
     noise."""
