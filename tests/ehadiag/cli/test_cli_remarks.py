@@ -162,7 +162,7 @@ def test_open_loop_needs_no_command_frames(run: Run, tmp_path: Path) -> None:
     ("every", "tested", "nuisances"),
     [
         pytest.param(100, True, NuisanceMode.AUTO, marks=pytest.mark.slow),
-        pytest.param(9, False, NuisanceMode.AUTO, marks=pytest.mark.slow),
+        pytest.param(9, True, NuisanceMode.AUTO, marks=pytest.mark.slow),
         (9, False, NuisanceMode.NONE),
     ],
 )
