@@ -63,7 +63,7 @@ from ehadiag.assess.verdict import (
 )
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FRICTION_NAME, with_unit
-from ehadiag.core.criteria import LOSSES, RECORDING, ROUNDS, VERDICT, noise_limit
+from ehadiag.core.criteria import LOSSES, NOISE_LIMIT, RECORDING, ROUNDS, VERDICT
 from ehadiag.estimate import Culprit, Effect
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
 from ehadiag.identify.identification_result import Identification
@@ -554,7 +554,7 @@ def _notes_on_effects(identification: Identification | None, actuator: Actuator)
             for name, value in calibration.effects.items()
             if name in identification.nuisances
             and abs(identification.nuisances[name].value - value)
-            > max(noise_limit() * stds[name], parameter(name).scale)
+            > max(NOISE_LIMIT * stds[name], parameter(name).scale)
         ]
     learned = (*learned, *DAILY_PRIORS)
     words = [parameter(name).short for name in identification.freed if name not in learned]

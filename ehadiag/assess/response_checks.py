@@ -22,12 +22,12 @@ from ehadiag.core.criteria import (
     ESTIMATION,
     FIT_ITERATIONS,
     LOSSES,
+    NOISE_LIMIT,
     READINGS,
     RECORDING,
     RESPONSE,
     ROUNDS,
     STD_OF_MEDIAN_SIZE,
-    noise_limit,
 )
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
@@ -85,7 +85,7 @@ def estimate_delays(experiment: Experiment, found: Identification) -> tuple[Dela
 def any_significant_delay(delays: Sequence[Delay]) -> bool:
     """Whether a delay is large and certain enough to be corrected."""
     return any(
-        abs(item.value) > max(RESPONSE.whole_tick, noise_limit() * item.std) for item in delays
+        abs(item.value) > max(RESPONSE.whole_tick, NOISE_LIMIT * item.std) for item in delays
     )
 
 
@@ -381,7 +381,7 @@ def creep_note(experiments: Sequence[Experiment], modelled: Sequence[Array]) -> 
     for item, model in zip(experiments, modelled, strict=True):
         for begin, end in () if item.test.closed_loop else item.test.windows.FSS:
             ticks = slice(round(begin / item.tick), round(end / item.tick))
-            least = noise_limit(ticks.stop - ticks.start) * math.sqrt(2.0) * item.spool_noise
+            least = NOISE_LIMIT * math.sqrt(2.0) * item.spool_noise
             steps = np.concatenate([steps, spool_steps(item.spool[ticks], least)])
             # The model has no noise.
             jumps = np.concatenate([jumps, spool_steps(model[ticks], 0.5 * least)])

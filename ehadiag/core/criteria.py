@@ -22,8 +22,10 @@ NORMAL_HALF_WIDTH_95 = NormalDist().inv_cdf(0.975)
 STD_OF_MEDIAN_SIZE = 1.0 / NormalDist().inv_cdf(0.75)
 """Deviation of a normal density over the median of its sizes, 1: 1.4826."""
 FALSE_ALARM_CHANCE = 1e-6
-"""Chance that noise alone exceeds a limit in deviations in any of a check's samples, 1: with some
-ten such checks a diagnosis it is once in a hundred thousand of these."""
+"""Chance that noise alone exceeds a limit in deviations, 1: of a delay, a changed effect, a step of
+the spool in a tick, of which six are needed."""
+NOISE_LIMIT = -NormalDist().inv_cdf(0.5 * FALSE_ALARM_CHANCE)
+"""Deviations that noise alone exceeds by that chance: 4.9."""
 ROUNDS = 3
 """Times that severities and what they were found from (samples, delays, instants) are found from
 one another at most, 1: each ends sooner where it changes nothing."""
@@ -34,11 +36,6 @@ FIT_ITERATIONS = 8
 def rms_with_outliers(share: float) -> float:
     """Rms, in deviations of the noise, of normal residuals with a share beyond three of them."""
     return 3.0 / -NormalDist().inv_cdf(0.5 * share)
-
-
-def noise_limit(count: int = 1) -> float:
-    """Deviations that noise alone exceeds in any of `count` samples by `FALSE_ALARM_CHANCE`."""
-    return -NormalDist().inv_cdf(FALSE_ALARM_CHANCE / (2.0 * count))
 
 
 class VerdictCriteria(msgspec.Struct, frozen=True):
