@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import cache
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from ehadiag.assess.response_checks import TRAVEL_SPAN_S, median_of_three
+from ehadiag.assess.response_checks import median_of_three
 from ehadiag.compile.jit import Array
-from ehadiag.core.actuator import Actuator
+from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.conversion import actuator_channels, conversion_of, largest_value
-from ehadiag.core.criteria import LOSSES, READINGS, RECORDING, RESPONSE
+from ehadiag.core.criteria import ESTIMATION, LOSSES, READINGS, RECORDING, RESPONSE
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.signals import COMMAND_FRAME_TOLERANCE
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
@@ -81,13 +81,7 @@ def objections_to_recording(
         *recording.quality.refused,
         *beyond,
         *_test_mismatches(samples, test, actuator),
-        *_gaps(
-            samples,
-            test,
-            RECORDING.max_missing_share_without_counter
-            if recording.by_time
-            else RECORDING.max_missing_share,
-        ),
+        *_gaps(samples, test),
         *objections_to_conditions(recording.environment, samples, actuator),
     ]
 
@@ -126,11 +120,8 @@ def _test_mismatches(samples: Samples, test: StoredTest, actuator: Actuator) -> 
     out = []
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     commands = int(np.isfinite(samples.command).sum())
-    if test.closed_loop and commands < RECORDING.min_command_frames:
-        if (
-            np.isfinite(samples.current[: test.ticks]).mean()
-            < RECORDING.min_current_share_without_command
-        ):
+    if test.closed_loop and commands < RECORDING.min_samples:
+        if np.isfinite(samples.current[: test.ticks]).mean() < RECORDING.min_sample_share:
             out.append(
                 f"{commands or 'no'} command frames in the recording, nor the servovalve current:"
                 " closed loop cannot be judged without: record the message with the command too,"
@@ -147,38 +138,26 @@ def _test_mismatches(samples: Samples, test: StoredTest, actuator: Actuator) -> 
     return out
 
 
-def _gaps(samples: Samples, test: StoredTest, most: float) -> list[str]:
-    out = []
+def _gaps(samples: Samples, test: StoredTest) -> list[str]:
+    out, least = [], RECORDING.min_sample_share
     for name, values in (("spool", samples.spool), ("pressure", samples.pressure)):
         present = np.flatnonzero(np.isfinite(values[: test.ticks]))
-        share = 1.0 - len(present) * _spacing(present) / test.ticks
+        share = 1.0 - len(present) / test.ticks
         edges = np.concatenate([[-1], present, [test.ticks]])
         longest = float(np.diff(edges).max() - 1) / test.rate
-        if share > most:
-            out.append(f"{share:.0%} of the {name} samples are missing (limit {most:.0%})")
+        if share > 1.0 - least:
+            out.append(f"{share:.0%} of the {name} samples are missing (limit {1.0 - least:.0%})")
         elif longest > RECORDING.max_sample_gap_s:
             out.append(
                 f"no {name} sample for {longest:.2f} s (limit {RECORDING.max_sample_gap_s:g} s)"
             )
     both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])
-    spacing = _spacing(np.flatnonzero(both))
     for search in test.windows.__struct_fields__:
         for start, end in getattr(test.windows, search):
             inside = both[round(start * test.rate) : round(end * test.rate)]
-            if (
-                inside.sum() * spacing
-                < RECORDING.min_sample_share_of_window * (end - start) * test.rate
-            ):
+            if inside.sum() < least * (end - start) * test.rate:
                 out.append(f"samples are missing in {start:g} … {end:g} s, which {search} needs")
     return out
-
-
-def _spacing(present: NDArray[np.int64]) -> int:
-    """Ticks between two samples: of a bus or a logger that brings each second tick none is lost."""
-    steps = np.diff(present)
-    return (
-        int(np.clip(np.median(steps), 1, RECORDING.max_sample_spacing_ticks)) if steps.size else 1
-    )
 
 
 def objections_to_conditions(
@@ -189,7 +168,7 @@ def objections_to_conditions(
     saturated = conversion_of(samples, actuator).saturated
     for index, name in ((1, "spool"), (2, "pressure"), (3, "position")):
         share = float(np.mean(saturated[index]))
-        if share > RECORDING.max_saturated_share:
+        if share > LOSSES.max_wrong_share:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
     return out + objections_to_environment(environment, actuator)
 
@@ -211,7 +190,7 @@ def objections_to_environment(environment: Environment, actuator: Actuator) -> l
     if environment.supply_pressure is not None and environment.return_pressure is not None:
         supply = environment.supply_pressure - environment.return_pressure
         usual = actuator.servovalve.PSR
-        least = RECORDING.min_supply_pressure_share
+        least = READINGS.min_supply_pressure_share
         if not least * usual <= supply <= READINGS.max_reading_factor * usual:
             out.append(
                 f"supply {supply / 1e6:.1f} MPa above return, "
@@ -254,15 +233,13 @@ def objection_to_current(experiment: Experiment) -> str:
         experiment.spool_noise / channels.spool.grain,
         experiment.pressure_noise / channels.pressure.grain,
     )
-    limit_lsb = max(
-        RECORDING.max_control_residual_lsb, RECORDING.max_current_residual_stds * noise_lsb
-    )
+    limit_lsb = RECORDING.max_control_residual_lsb * max(1.0, noise_lsb / ESTIMATION.noise_lsb)
     if not trace.residual_lsb > limit_lsb:
         return ""
     return (
         f"servovalve current {trace.residual_lsb:.1f} LSB rms from what the "
         f"{'control law' if experiment.test.closed_loop else 'command'} gives (limit "
-        f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
+        f"{limit_lsb:.2g}): controller data wrong, or the current driver failed"
     )
 
 
@@ -286,9 +263,9 @@ def notes_on_recording(
     if test is not None and len(present):
         first = float(present[0]) / test.rate
         last = max(test.ticks - 1 - float(present[-1]), 0.0) / test.rate
-        if first >= RECORDING.min_missing_end_s:
+        if first >= RECORDING.max_frame_delay_s:
             out.append(f"the first {first:.3f} s of the test are missing")
-        if last >= RECORDING.min_missing_end_s:
+        if last >= RECORDING.max_frame_delay_s:
             out.append(f"the last {last:.3f} s of the test are missing: the recording ends early")
         elif recording.outcome.state is BitState.RUNNING:
             out.append("the recording ends before the computer's word that the test is complete")
@@ -302,11 +279,11 @@ def _plain_words(name: str) -> str:
 def objection_to_lost_positions(experiment: Experiment) -> str:
     """Reason why a test's current cannot be rebuilt; empty if it can."""
     guessed = experiment.trace.guessed
-    if guessed <= LOSSES.max_guessed_share:
+    if guessed <= LOSSES.max_wrong_share:
         return ""
     return (
         f"{guessed:.1%} of the jack positions that the control law worked on are lost "
-        f"(limit {LOSSES.max_guessed_share:.1%}) and not told by the response: the servovalve "
+        f"(limit {LOSSES.max_wrong_share:.1%}) and not told by the response: the servovalve "
         f"current cannot "
         "be rebuilt"
     )
@@ -315,27 +292,26 @@ def objection_to_lost_positions(experiment: Experiment) -> str:
 def objection_to_frame_order(recording: Recording) -> str:
     """Reason why the ticks of a recording's samples are uncertain; empty if they are not."""
     share = recording.out_of_order
-    if not recording.by_time or share <= LOSSES.max_out_of_order_share:
+    if not recording.by_time or share <= LOSSES.max_wrong_share:
         return ""
     return (
         f"by their time stamps {share:.0%} of the commands are of other ticks (limit "
-        f"{LOSSES.max_out_of_order_share:.0%}): the frames have lost their order, and no counter "
+        f"{LOSSES.max_wrong_share:.1%}): the frames have lost their order, and no counter "
         "tells it"
     )
 
 
-VELOCITY_SPAN_S = 0.05
-"""Over which a velocity is taken."""
+UNITS = (
+    (1000.0, "a unit 1000 times smaller was sent", "a unit 1000 times larger was sent"),
+    (10.0, "a unit ten times smaller was sent", "a unit ten times larger was sent"),
+    (25.4, "millimetres were sent as inches", "inches were sent as millimetres"),
+    (14.5038, "psi were sent as bar", "bar were sent as psi"),
+)
+"""Ratios of units that are taken for one another; what multiplies, and what divides by one."""
 UNIT_ERROR_FACTORS: tuple[tuple[float, str], ...] = (
     (-1.0, "its sign is reversed"),
-    (1e-3, "a unit 1000 times larger was sent"),
-    (1e3, "a unit 1000 times smaller was sent"),
-    (0.1, "a unit ten times larger was sent"),
-    (10.0, "a unit ten times smaller was sent"),
-    (25.4, "millimetres were sent as inches"),
-    (1.0 / 25.4, "inches were sent as millimetres"),
-    (14.5038, "psi were sent as bar"),
-    (1.0 / 14.5038, "bar were sent as psi"),
+    *((factor, more) for factor, more, _ in UNITS),
+    *((1.0 / factor, less) for factor, _, less in UNITS),
 )
 """Measured over true value, and what makes that."""
 
@@ -359,8 +335,7 @@ def channel_relations(samples: Samples, actuator: Actuator) -> tuple[ChannelRela
     its command, or of the control law (PHY-2, PHY-3).
     """
     valve, jack = actuator.servovalve, actuator.jack
-    half = max(round(0.5 * VELOCITY_SPAN_S * 1e9 / samples.period_ns), 1)
-    velocity = _velocity(samples.position, half, samples.period_ns * 1e-9)
+    velocity, half = _velocity(samples)
     found = [
         _relation("spool", "current", samples.spool, samples.current, valve.GM / valve.KSF),
         _relation("position", "spool", velocity, _smooth(samples.spool, half), valve.GQ / jack.AJ),
@@ -390,7 +365,7 @@ def objections_to_readings(samples: Samples, actuator: Actuator) -> list[str]:
         values = np.abs(np.asarray(getattr(samples, channel.name)))
         values = values[np.isfinite(values)]
         largest, unit = largest_value(actuator, channel), channel.per_unit
-        top = float(np.quantile(values, 0.99)) if values.size else 0.0
+        top = float(np.quantile(values, 1.0 - LOSSES.max_wrong_share)) if values.size else 0.0
         if top > READINGS.max_reading_factor * largest:
             out.append(
                 f"{channel.name} reads {top / unit:.3g} {channel.unit}, the actuator reaches"
@@ -431,23 +406,17 @@ def _explained(found: tuple[ChannelRelation, ...]) -> tuple[str, ...]:
 def _pressure(samples: Samples, actuator: Actuator, moved: set[str]) -> tuple[str, ...]:
     """Hold the pressure that moves the jack against the friction that it may have."""
     jack = actuator.jack
-    half = max(round(0.5 * VELOCITY_SPAN_S * 1e9 / samples.period_ns), 1)
-    velocity = _velocity(samples.position, half, samples.period_ns * 1e-9)
-    present = (
-        np.isfinite(velocity)
-        & np.isfinite(samples.pressure)
-        & (np.abs(velocity) > READINGS.min_jack_speed_m_per_s)
-    )
-    if present.sum() < READINGS.min_moving_ticks or "spool" not in moved:
+    velocity, _ = _velocity(samples)
+    present = np.isfinite(velocity) & np.isfinite(samples.pressure)
+    if present.sum() < RECORDING.min_samples or "spool" not in moved:
         return ()
+    present &= np.abs(velocity) > np.median(np.abs(velocity[present]))
     force = jack.AJ * samples.pressure[present] - jack.FR
     usual = float(np.median(np.abs(force)))
-    low, high = (
-        READINGS.friction_range_shares[0] * jack.FDJ0,
-        READINGS.friction_range_shares[1] * jack.FDJ1,
-    )
+    # Viscous friction adds to it.
+    low, high = jack.FDJ0, (1.0 + READINGS.max_channel_ratio_error) * jack.FDJ1
     ahead = float(np.mean(np.sign(force) == np.sign(velocity[present])))
-    if ahead < 0.35:
+    if ahead < 0.5:
         return ("pressure: its sign is reversed against the jack's motion, or the mapping says so",)
     if low <= usual <= high:
         return ()
@@ -465,25 +434,27 @@ def _relation(
     upper: str, lower: str, y: Array, x: Array, expected: float
 ) -> ChannelRelation | None:
     present = np.isfinite(x) & np.isfinite(y)
-    if present.sum() < READINGS.min_moving_ticks:
+    if present.sum() < RECORDING.min_samples:
         return None
     x, y = x[present] - x[present].mean(), y[present] - y[present].mean()
     power, other = float(x @ x), float(y @ y)
     if (
         power == 0.0
         or other == 0.0
-        or abs(float(x @ y)) < READINGS.min_channel_correlation * np.sqrt(power * other)
+        or abs(float(x @ y)) < READINGS.min_correlation * np.sqrt(power * other)
     ):
         return None
     return ChannelRelation(upper, lower, float(x @ y) / power / expected)
 
 
-def _velocity(position: Array, half: int, period: float) -> Array:
-    """Mean velocity about each tick, m/s; NaN near the ends."""
+def _velocity(samples: Samples) -> tuple[Array, int]:
+    """Mean velocity of the jack about each tick, m/s, NaN near the ends; half its span, ticks."""
+    position, period = samples.position, samples.period_ns * 1e-9
+    half = max(round(0.5 * RESPONSE.travel_span_s / period), 1)
     out = np.full(len(position), np.nan)
     if len(position) > 2 * half:
         out[half:-half] = (position[2 * half :] - position[: -2 * half]) / (2 * half * period)
-    return out
+    return out, half
 
 
 def _smooth(values: Array, half: int) -> Array:
@@ -509,20 +480,20 @@ def objections_to_travel(samples: Samples, test: StoredTest, actuator: Actuator)
     if travels is None:
         return []
     expected, measured = travels
-    least = RESPONSE.min_rms_travel_lsb * actuator_channels(actuator).position.grain
+    least = RESPONSE.max_still_lsb * actuator_channels(actuator).position.grain
     moved = float(expected.std()), float(measured.std())
     if max(moved) < least:
         return []
     correlation = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
     correlation /= max(moved[0] * moved[1], np.finfo(np.float64).tiny)
-    if correlation >= READINGS.min_travel_correlation:
+    if correlation >= READINGS.min_correlation:
         return []
     spool_follows = any(
         item.upper == "spool" and item.lower == "current" and item.ratio > 0.0
         for item in channel_relations(samples, actuator)
     )
     sensor = "position" if spool_follows else "spool"
-    if correlation < -READINGS.min_travel_correlation:
+    if correlation < -READINGS.min_correlation:
         return [f"the {sensor} sensor reads with the wrong sign"]
     what = (
         "the position does not follow the flow that the spool lets through: jack seized or at its "
@@ -533,16 +504,16 @@ def objections_to_travel(samples: Samples, test: StoredTest, actuator: Actuator)
     )
     return [
         f"{what} (correlation of the jack's travel with the spool's flow {correlation:.2f}, "
-        f"at least {READINGS.min_travel_correlation:g} needed)"
+        f"at least {READINGS.min_correlation:.2g} needed)"
     ]
 
 
 def _travels(samples: Samples, actuator: Actuator) -> tuple[Array, Array] | None:
     """Travel over the span by the spool's flow and by the position sensor, m; None: too few."""
     tick = samples.period_ns * 1e-9
-    span = round(TRAVEL_SPAN_S / tick)
+    span = round(RESPONSE.travel_span_s / tick)
     seen = np.flatnonzero(np.isfinite(samples.spool))
-    if len(seen) < RESPONSE.min_travel_share * len(samples.spool) or len(samples.spool) <= span + 2:
+    if len(seen) < RECORDING.min_samples or len(samples.spool) <= span + 2:
         return None
     spool = np.interp(np.arange(len(samples.spool)), seen, samples.spool[seen])
     gain = actuator.servovalve.GQ / actuator.jack.AJ
@@ -551,7 +522,7 @@ def _travels(samples: Samples, actuator: Actuator) -> tuple[Array, Array] | None
     position = _without_spikes(samples.position)
     measured = position[span:] - position[:-span]
     present = np.isfinite(measured)
-    if present.mean() < RESPONSE.min_travel_share:
+    if present.sum() < RECORDING.min_samples:
         return None
     return expected[present], measured[present]
 
@@ -567,32 +538,41 @@ def _without_spikes(values: Array) -> Array:
 
 def objections_to_actuator(actuator: Actuator) -> list[str]:
     """Why an actuator file cannot be right, with the data to look at; empty if it can."""
+    most = READINGS.max_actuator_ratio_factor
+    usual = _usual_ratios()
+    return [
+        f"actuator file: {what} is {ratio:.2g}, usual is {usual[what, data]:.2g}: check {data}"
+        for (what, data), ratio in _ratios(actuator).items()
+        if not 1.0 / most <= ratio / usual[what, data] <= most
+    ]
+
+
+@cache
+def _usual_ratios() -> dict[tuple[str, str], float]:
+    return _ratios(default_actuator())
+
+
+def _ratios(actuator: Actuator) -> dict[tuple[str, str], float]:
+    """Ratios that are alike for actuators of all sizes, by what they are and of which data."""
     controller, valve, jack = actuator.controller, actuator.servovalve, actuator.jack
     slew = valve.GQF * valve.XFM / valve.AS
     speed = valve.GQ * valve.XSM / jack.AJ
     force = valve.GPF * valve.XFM * valve.AS
-    ratios = (
-        ("spool travel at rated current over spool stop", "GM, IM, KSF, XSM",
-         valve.GM * controller.IM / valve.KSF / valve.XSM, 1.0),
-        ("flapper travel at rated current over flapper stop", "GM, IM, KF, XFM",
-         valve.GM * controller.IM / valve.KF / valve.XFM, 2.0),
-        ("spool travel in 1 s over spool stop", "GQF, XFM, AS, XSM", slew / valve.XSM, 500.0),
-        ("first stage's force over spool friction at the limit", "GPF, XFM, AS, FSS1",
-         force / valve.FSS1, 5.0),
-        ("spool acceleration by the first stage over that in 0.1 ms", "GPF, XFM, AS, MS, GQF",
-         force / valve.MS / (slew / 1e-4), 20.0),
-        ("pressure at the spool's stop over supply", "GP, XSM, PSR",
-         valve.GP * valve.XSM / valve.PSR, 40.0),
-        ("jack travel in 1 s over jack stop", "GQ, XSM, AJ, XJM", speed / jack.XJM, 3.0),
-        ("jack force over jack friction at the limit", "PSR, AJ, FDJ1",
-         valve.PSR * jack.AJ / jack.FDJ1, 10.0),
-        ("jack acceleration by the supply over that in 10 ms", "PSR, AJ, MJ, GQ, XSM",
-         valve.PSR * jack.AJ / jack.MJ / (speed / 1e-2), 15.0),
-    )  # fmt: skip
-    return [
-        f"actuator file: {what} is {ratio:.2g}, usual is {usual:g}: check {data}"
-        for what, data, ratio, usual in ratios
-        if not usual / READINGS.max_actuator_ratio_factor
-        <= ratio
-        <= usual * READINGS.max_actuator_ratio_factor
-    ]
+    return {
+        ("spool travel at rated current over spool stop", "GM, IM, KSF, XSM"):
+            valve.GM * controller.IM / valve.KSF / valve.XSM,
+        ("flapper travel at rated current over flapper stop", "GM, IM, KF, XFM"):
+            valve.GM * controller.IM / valve.KF / valve.XFM,
+        ("spool travel in 1 s over spool stop", "GQF, XFM, AS, XSM"): slew / valve.XSM,
+        ("first stage's force over spool friction at the limit", "GPF, XFM, AS, FSS1"):
+            force / valve.FSS1,
+        ("spool acceleration by the first stage over that to its speed in 1 s",
+         "GPF, XFM, AS, MS, GQF"): force / valve.MS / slew,
+        ("pressure at the spool's stop over supply", "GP, XSM, PSR"):
+            valve.GP * valve.XSM / valve.PSR,
+        ("jack travel in 1 s over jack stop", "GQ, XSM, AJ, XJM"): speed / jack.XJM,
+        ("jack force over jack friction at the limit", "PSR, AJ, FDJ1"):
+            valve.PSR * jack.AJ / jack.FDJ1,
+        ("jack acceleration by the supply over that to its speed in 1 s", "PSR, AJ, MJ, GQ, XSM"):
+            valve.PSR * jack.AJ / jack.MJ / speed,
+    }  # fmt: skip

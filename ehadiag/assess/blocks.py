@@ -4,36 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, RESPONSE
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.least_squares import Refinement
 from ehadiag.identify.prior import FAULT_OF_DATUM, severity_of_datum
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.residual_models import ModelResponse
+from ehadiag.model.severities import FAULT_LAWS
 
 BLOCKS = ("torque", "spool", "pressure", "jack")
 """Torque motor and first stage; spool with its friction; second stage; jack."""
-
-
-class BlockRules(msgspec.Struct, frozen=True):
-    """Which sample is of which block."""
-
-    slew_share: float = 0.1
-    """Least speed of a slewing spool, as a share of its stroke a tick, 1: it is the first stage
-    that limits it, not friction."""
-    jack_ticks: int = 20
-    """Ticks over which the jack's travel is looked at, 1."""
-    jack_lsb: float = 4.0
-    """Least travel of a moving jack meanwhile, LSB."""
-
-
-RULES = BlockRules()
 
 
 def block_masks(experiments: Sequence[Experiment]) -> dict[str, NDArray[np.bool_]]:
@@ -51,11 +36,14 @@ def block_masks(experiments: Sequence[Experiment]) -> dict[str, NDArray[np.bool_
     """
     slews, moves = [], []
     for item in experiments:
-        speed = np.abs(np.gradient(np.nan_to_num(item.spool)))
-        slews.append(speed > RULES.slew_share * item.constants.XSM)
-        place = np.nan_to_num(item.position)
-        ahead = np.roll(place, -RULES.jack_ticks // 2) - np.roll(place, RULES.jack_ticks // 2)
-        moves.append(np.abs(ahead) > RULES.jack_lsb * item.channels.position.lsb)
+        new, filter_law = item.constants, FAULT_LAWS["Kintas"]
+        # With a filter at its limit the first stage still moves the spool so fast.
+        slewing = (1.0 + filter_law.change) * new.GQF * new.XFM / new.AS
+        speed = np.abs(np.gradient(np.nan_to_num(item.spool), item.tick))
+        slews.append(speed > slewing)
+        place, half = np.nan_to_num(item.position), round(0.5 * RESPONSE.travel_span_s / item.tick)
+        ahead = np.roll(place, -half) - np.roll(place, half)
+        moves.append(np.abs(ahead) > RESPONSE.max_still_lsb * item.channels.position.lsb)
     slew, move = np.concatenate(slews), np.concatenate(moves)
     out = {}
     for name, row, ticks in (

@@ -49,7 +49,6 @@ from ehadiag.assess.response_checks import (
     objections_to_supply,
 )
 from ehadiag.assess.sampling_instants import (
-    INSTANTS,
     settle_instants,
     why_sampled_seldom,
     widen_by_instants,
@@ -64,7 +63,7 @@ from ehadiag.assess.verdict import (
 )
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FRICTION_NAME, with_unit
-from ehadiag.core.criteria import FIT, LOSSES, RECORDING, VERDICT
+from ehadiag.core.criteria import LOSSES, NOISE_LIMIT, RECORDING, ROUNDS, VERDICT
 from ehadiag.estimate import Culprit, Effect
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
 from ehadiag.identify.identification_result import Identification
@@ -186,7 +185,7 @@ class DiagnosisSession:
             return
         experiment = build_experiment(samples, recording.environment, test, self._actuator)
         for values in (experiment.spool, experiment.pressure):
-            if np.isfinite(values).mean() < 1.0 - RECORDING.max_missing_share:
+            if np.isfinite(values).mean() < RECORDING.min_sample_share:
                 return
         self._session.feed([experiment])
 
@@ -324,7 +323,7 @@ class DiagnosisSession:
     ) -> tuple[list[Experiment], Identification]:
         """Identify together with the instants at which an acquisition sampled."""
         start = self._session.searched(experiments)
-        for _ in range(INSTANTS.rounds):
+        for _ in range(ROUNDS):
             settled, variance = settle_instants(experiments, start)
             found = widen_by_instants(self._session.finish(settled, progress), variance)
             if not any(objections_to_estimate(found, self._actuator.calibration)):
@@ -555,10 +554,7 @@ def _notes_on_effects(identification: Identification | None, actuator: Actuator)
             for name, value in calibration.effects.items()
             if name in identification.nuisances
             and abs(identification.nuisances[name].value - value)
-            > max(
-                FIT.min_effect_change_stds * stds[name],
-                FIT.min_effect_change_scales * parameter(name).scale,
-            )
+            > max(NOISE_LIMIT * stds[name], parameter(name).scale)
         ]
     learned = (*learned, *DAILY_PRIORS)
     words = [parameter(name).short for name in identification.freed if name not in learned]

@@ -9,6 +9,7 @@ of dirty pictures, J. R. Statist. Soc. B 48(3), 1986).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import ESTIMATION, LOSSES
+from ehadiag.core.criteria import ESTIMATION, LOSSES, ROUNDS
 from ehadiag.identify.estimates import interval95
 from ehadiag.identify.experiment import (
     ANCHOR_THRESHOLDS_LSB,
@@ -37,7 +38,7 @@ from firmware_iface.recording import Recording, Samples
 
 def has_observable_severity(experiments: Sequence[Experiment]) -> bool:
     """Whether so few positions are lost that some severity can be observed."""
-    return all(item.trace.guessed <= LOSSES.max_guessed_share_observable for item in experiments)
+    return all(item.trace.guessed <= LOSSES.max_guessed_share for item in experiments)
 
 
 def restrict_to_observable(
@@ -51,7 +52,10 @@ def restrict_to_observable(
     hidden = [name for name, law in FAULT_LAWS.items() if closed and law.needs_each_tick]
     estimates = tuple(_widened_estimate(item, hidden) for item in found.estimates)
     scale = np.array(
-        [new.std / max(old.std, 1e-12) for new, old in zip(estimates, found.estimates, strict=True)]
+        [
+            new.std / max(old.std, np.finfo(np.float64).tiny)
+            for new, old in zip(estimates, found.estimates, strict=True)
+        ]
     )
     covariance = found.covariance * np.outer(scale, scale)
     restored = " and ".join(
@@ -72,38 +76,16 @@ def _widened_estimate(item: Estimate, hidden: Sequence[str]) -> Estimate:
     return replace(item, std=std, interval95=interval95(item.value, std))
 
 
-class ReconstructionRules(msgspec.Struct, frozen=True):
-    """Search for lost positions and misplaced rows."""
-
-    response_ticks: int = 30
-    """Ticks in which a wrong current shows, 1."""
-    spacing_per_run: int = 40
-    """Least spacing of two changes tried in one run of the model, ticks: longer than
-    `response_ticks`, in which each shows."""
-    spacing_per_sweep: int = 8
-    """Least spacing of two changes made at once, ticks."""
-    code_offsets: tuple[int, ...] = (0, -1, 1, -2, 2)
-    """Distances of a lost position from a straight line between its neighbours, LSB: its noise and
-    rounding are 0.6 LSB."""
-    position_variance_lsb2: float = 1.3
-    """Variance of that distance by noise, rounding and the straight line, LSB²."""
-    max_rows_of_run: int = 3
-    """Largest number of rows moved together next to a gap, 1; besides all up to the next gap."""
-    max_rows: int = 40
-    """Largest number of the latter, 1."""
-    current_cap: float = 16.0
-    """Largest square of a residual of the current that counts, in variances."""
-    current_noise_lsb: float = 0.6
-    """Noise of the current with its rounding, LSB."""
-    sweeps: int = 3
-    """Largest number of sweeps over all changes between two identifications, 1."""
-    identifications: int = 3
-    """Largest number of identifications, 1."""
-    min_changes: int = 3
-    """Least number of changes for another sweep, 1."""
-
-
-RECONSTRUCTION = ReconstructionRules()
+RESPONSE_TICKS = 30
+"""Ticks in which a wrong current shows, 1, some periods of first stage and spool: changes tried in
+one run of the model, or made at once, are so far apart; more rows at once are not moved."""
+POSITION_VARIANCE = 1.5 * ESTIMATION.noise_lsb**2
+"""Variance of a position about a straight line between its neighbours by their noise, LSB²."""
+CODE_OFFSETS = range(
+    -math.floor(ESTIMATION.cauchy_scale * math.sqrt(POSITION_VARIANCE)),
+    math.floor(ESTIMATION.cauchy_scale * math.sqrt(POSITION_VARIANCE)) + 1,
+)
+"""Distances of a lost position from such a line that are tried, LSB: two on either side."""
 
 
 class SampleChange(msgspec.Struct, frozen=True):
@@ -131,10 +113,7 @@ def is_reconstructible(recordings: Sequence[Recording], experiments: Sequence[Ex
     correct.
     """
     shares = [item.trace.guessed for item in experiments]
-    if (
-        len(recordings) != len(shares)
-        or max(shares, default=0.0) > LOSSES.max_guessed_share_reconstructed
-    ):
+    if len(recordings) != len(shares) or max(shares, default=0.0) > LOSSES.max_guessed_share:
         return False
     return any(
         share > 0.0 or _is_movable(item) for share, item in zip(shares, recordings, strict=True)
@@ -159,11 +138,7 @@ def reconstruct_lost_samples(
         for each in zip(recordings, experiments, shared, strict=True)
     ]
     restored = moved = 0
-    for _ in range(
-        RECONSTRUCTION.identifications
-        if found.fit.outliers <= LOSSES.max_outlier_share_reconstructed
-        else 0
-    ):
+    for _ in range(ROUNDS):
         made = [change for item in rows for change in item.improve(found)]
         restored += sum(not item.by for item in made)
         moved += sum(abs(item.by) * (item.end - item.begin) for item in made)
@@ -171,8 +146,6 @@ def reconstruct_lost_samples(
             break
         now = [item.experiment() for item in rows]
         found = identify(now)
-        if len(made) < RECONSTRUCTION.min_changes:
-            break
     if not restored and not moved:
         return None
     words = [f"{restored} lost jack positions that the control law worked on"] if restored else []
@@ -233,11 +206,11 @@ class _RowReconstruction:
             for way in (ANCHOR_THRESHOLDS_LSB, None)
         }
         self._anchor = ways[min(ways)]
-        for _ in range(RECONSTRUCTION.sweeps):
+        for _ in range(ROUNDS):
             chosen = self._sweep(found)
             self._samples = _apply_changes(self._samples, chosen)
             made += chosen
-            if len(chosen) < RECONSTRUCTION.min_changes:
+            if not chosen:
                 break
         return made
 
@@ -247,7 +220,7 @@ class _RowReconstruction:
         for together in _spaced_changes(self._changes()):
             after = self._misfit(_apply_changes(self._samples, together), found, self._anchor)
             for change in together:
-                seen = slice(max(change.first - 1, 0), change.end + RECONSTRUCTION.response_ticks)
+                seen = slice(max(change.first - 1, 0), change.end + RESPONSE_TICKS)
                 gain = float(np.sum(before[seen] - after[seen])) - change.penalty
                 gains.append((gain, change))
         return _best_changes(gains)
@@ -274,9 +247,9 @@ class _RowReconstruction:
                         tick + 1,
                         0,
                         (code + off) * step,
-                        off * off / RECONSTRUCTION.position_variance_lsb2,
+                        off * off / POSITION_VARIANCE,
                     )
-                    for off in RECONSTRUCTION.code_offsets
+                    for off in CODE_OFFSETS
                 ]
         return out + (_row_moves(_empty_ticks(samples)) if self._movable else [])
 
@@ -307,11 +280,10 @@ class _RowReconstruction:
             lay_out_spans([item], anchor_lsb=anchor), Unknowns((), (constants,), {})
         )
         left = model.residuals(np.zeros((1, 0)))[0][0]
-        trace, noise = item.trace, RECONSTRUCTION.current_noise_lsb * item.channels.current.lsb
+        trace, noise = item.trace, ESTIMATION.noise_lsb * item.channels.current.lsb
         current = np.nan_to_num((samples.current - trace.offset - trace.current) / noise)
         return np.asarray(
-            np.minimum(left**2, ESTIMATION.residual_cap).sum(axis=0)
-            + np.minimum(current**2, RECONSTRUCTION.current_cap)
+            np.minimum(np.vstack([left, current]) ** 2, ESTIMATION.residual_cap).sum(axis=0)
         )
 
 
@@ -321,21 +293,13 @@ def _row_moves(lost: NDArray[np.bool_]) -> list[SampleChange]:
     gaps = np.flatnonzero(np.concatenate([[True], lost, [True]])) - 1
     for before, after in zip(gaps[:-1].tolist(), gaps[1:].tolist(), strict=True):
         row = after - before - 1
-        counts = {
-            *range(1, min(row, RECONSTRUCTION.max_rows_of_run) + 1),
-            *([row] if 0 < row <= RECONSTRUCTION.max_rows else []),
-        }
-        for count in sorted(counts):
+        for count in sorted({1, row if row <= RESPONSE_TICKS else 1}) if row else ():
             if before >= 0:
                 out.append(
-                    SampleChange(
-                        before + 1, before + 1 + count, -1, np.nan, LOSSES.min_gain_moved_rows
-                    )
+                    SampleChange(before + 1, before + 1 + count, -1, np.nan, LOSSES.min_gain)
                 )
             if after < len(lost):
-                out.append(
-                    SampleChange(after - count, after, 1, np.nan, LOSSES.min_gain_moved_rows)
-                )
+                out.append(SampleChange(after - count, after, 1, np.nan, LOSSES.min_gain))
     return out
 
 
@@ -368,7 +332,7 @@ def _spaced_changes(changes: Sequence[SampleChange]) -> Iterator[list[SampleChan
         together: list[SampleChange] = []
         others: list[SampleChange] = []
         for item in left:
-            free = not together or item.first >= together[-1].end + RECONSTRUCTION.spacing_per_run
+            free = not together or item.first >= together[-1].end + RESPONSE_TICKS
             (together if free else others).append(item)
         yield together
         left = others
@@ -384,13 +348,12 @@ def _best_changes(gains: Sequence[tuple[float, SampleChange]]) -> list[SampleCha
     for each in restored.values():
         each.sort(key=lambda pair: -pair[0])
         margin = each[0][0] - each[1][0]
-        if margin > LOSSES.min_gain_lost_position:
+        if margin > LOSSES.min_gain:
             wanted.append((margin, each[0][1]))
     chosen: list[SampleChange] = []
     for _, item in sorted(wanted, key=lambda pair: -pair[0]):
         if all(
-            item.first >= other.end + RECONSTRUCTION.spacing_per_sweep
-            or other.first >= item.end + RECONSTRUCTION.spacing_per_sweep
+            item.first >= other.end + RESPONSE_TICKS or other.first >= item.end + RESPONSE_TICKS
             for other in chosen
         ):
             chosen.append(item)

@@ -14,7 +14,6 @@ import math
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 
-import msgspec
 import numpy as np
 
 from ehadiag.assess.verdict import Verdict, is_explained_by_discrepancy_alone
@@ -22,7 +21,14 @@ from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import finite
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95, VERDICT
+from ehadiag.core.criteria import (
+    ESTIMATION,
+    FIT,
+    NORMAL_HALF_WIDTH_95,
+    RECORDING,
+    RESPONSE,
+    VERDICT,
+)
 from ehadiag.estimate import Culprit, Effect, Suspect
 from ehadiag.identify.experiment import (
     Experiment,
@@ -168,30 +174,12 @@ def _limit(item: Effect) -> str:
 CULPRIT_SIGNALS = ("spool", "pressure")
 
 
-class SuspectSearch(msgspec.Struct, frozen=True):
-    """Search for parameters that would explain a recording."""
-
-    difference: float = 0.2
-    """Width of the differences, in units of the parameters' scales."""
-    step_shares: tuple[float, ...] = (0.4, 1.0)
-    """Shares of the Gauss-Newton step that are tried besides none, 1."""
-    refined: int = 4
-    """Number of suspects that are refined, 1."""
-    min_tried_share: float = 0.1 * FIT.min_suspect_share
-    """Least share of the unexplained cost that a step promises, and then explains, for the next
-    trial, 1: a tenth of what names a parameter, since a refinement makes up to nine times as much
-    of it; of 140 that were named 139 promised it."""
-    steps: int = 2
-    """Steps of that refinement, 1."""
-    ridge: float = 1e-6
-    """Share added to the diagonal of the normal matrix, 1."""
-    named: int = 3
-    """Largest number of suspects that are named, 1."""
-    time_quantiles: tuple[float, float] = (0.1, 0.9)
-    """Quantiles of the unexplained cost between which its time is named, 1."""
-
-
-SUSPECTS = SuspectSearch()
+DIFFERENCE = 0.2
+"""Width of the differences for derivatives, in units of the parameters' scales: with a whole scale
+two of 25 causes of unexplained recordings went unnamed, and one was found."""
+NAMED = 3
+"""Largest number of suspects that are refined and named, 1: of broken hardware the first explains
+most of what any does, if there is one."""
 
 
 def find_culprit(
@@ -240,16 +228,18 @@ def _suspects(model: SimdModel, x: Array, base: Array, estimated: set[str]) -> t
     slopes = _slopes(model.residuals(x + np.diag(sides))[0], base, sides)
     normal, gradient = _normal_equations(slopes, base)
     steps = np.array([_step(normal, gradient, [*own, k]) for k in tried])
-    promising = np.flatnonzero(-steps @ gradient >= SUSPECTS.min_tried_share * before)
+    # A refinement makes up to nine times as much of what a step promises.
+    promised = FIT.min_suspect_share**2 * before
+    promising = np.flatnonzero(-steps @ gradient >= promised)
     if not len(promising):
         return ()
     tried = [tried[place] for place in promising]
     points = np.repeat(x[None, :], len(tried), axis=0)
     points, costs = _best_share(model, points, np.full(len(tried), before), steps[promising])
-    first = np.argsort(costs)[: SUSPECTS.refined]
-    first = first[costs[first] <= (1.0 - SUSPECTS.min_tried_share) * before]
+    first = np.argsort(costs)[:NAMED]
+    first = first[costs[first] <= before - promised]
     points, costs = points[first], costs[first]
-    for _ in range(SUSPECTS.steps if len(first) else 0):
+    for _ in range(2 if len(first) else 0):
         points, costs = _improved(model, points, costs, [[*own, tried[place]] for place in first])
     order = np.argsort(costs)
     out = (
@@ -257,7 +247,7 @@ def _suspects(model: SimdModel, x: Array, base: Array, estimated: set[str]) -> t
         for place in order
         for k in (tried[first[place]],)
     )
-    return tuple(item for item in out if item.share >= FIT.min_suspect_share)[: SUSPECTS.named]
+    return tuple(item for item in out if item.share >= FIT.min_suspect_share)
 
 
 def _improved(
@@ -283,9 +273,9 @@ def _sides(model: SimdModel, x: Array) -> Array:
     scale = np.array([item.scale for item in model.unknowns.free])
     return (
         np.where(
-            x + SUSPECTS.difference * scale <= model.unknowns.upper,
-            SUSPECTS.difference,
-            -SUSPECTS.difference,
+            x + DIFFERENCE * scale <= model.unknowns.upper,
+            DIFFERENCE,
+            -DIFFERENCE,
         )
         * scale
     )
@@ -293,23 +283,20 @@ def _sides(model: SimdModel, x: Array) -> Array:
 
 def _slopes(runs: Array, base: Array, sides: Array) -> Array:
     """Derivatives over the parameters' scales, shape (k, signals * N)."""
-    return ((runs - base) / (np.sign(sides) * SUSPECTS.difference)[:, None, None]).reshape(
-        len(runs), -1
-    )
+    return ((runs - base) / (np.sign(sides) * DIFFERENCE)[:, None, None]).reshape(len(runs), -1)
 
 
 def _normal_equations(slopes: Array, base: Array) -> tuple[Array, Array]:
     """Normal matrix and gradient of residuals, by Cauchy's weights."""
     left = base.ravel()
     weighed = slopes / (1.0 + (left / ESTIMATION.cauchy_scale) ** 2)
-    normal = weighed @ slopes.T
-    return normal + SUSPECTS.ridge * np.diag(np.diag(normal) + 1.0), weighed @ left
+    return weighed @ slopes.T, weighed @ left
 
 
 def _step(normal: Array, gradient: Array, chosen: list[int]) -> Array:
     """Gauss-Newton step in the chosen coordinates, in units of the scales; 0 in the others."""
     out = np.zeros(len(gradient))
-    out[chosen] = -np.linalg.solve(normal[np.ix_(chosen, chosen)], gradient[chosen])
+    out[chosen] = -np.linalg.pinv(normal[np.ix_(chosen, chosen)], hermitian=True) @ gradient[chosen]
     return out
 
 
@@ -319,11 +306,9 @@ def _best_share(
     """Best of some shares of each step and none, and its cost; before: costs of the points."""
     scale = np.array([item.scale for item in model.unknowns.free])
     lower, upper = model.unknowns.lower, model.unknowns.upper
-    there = np.stack(
-        [np.clip(points + s * steps * scale, lower, upper) for s in SUSPECTS.step_shares]
-    )
+    there = np.stack([np.clip(points + s * steps * scale, lower, upper) for s in (0.5, 1.0)])
     costs = _cost(model.residuals(there.reshape(-1, points.shape[1]))[0]).sum(axis=(1, 2))
-    costs = np.vstack([before, costs.reshape(len(SUSPECTS.step_shares), -1)])
+    costs = np.vstack([before, costs.reshape(len(there), -1)])
     best, places = costs.argmin(axis=0), np.arange(len(points))
     return np.concatenate([points[None], there])[best, places], costs[best, places]
 
@@ -345,10 +330,10 @@ def _worst_place(
     parts = [_cost(part) for part in residuals_by_experiment(experiments, residuals)]
     sums = np.array([part.sum(axis=1) for part in parts])
     index, row = divmod(int(sums.argmax()), sums.shape[1])
+    share = FIT.min_suspect_share
     grown = np.cumsum(parts[index][row])
     start, end = (
-        np.searchsorted(grown, np.array(SUSPECTS.time_quantiles) * grown[-1])
-        * experiments[index].tick
+        np.searchsorted(grown, np.array([share, 1.0 - share]) * grown[-1]) * experiments[index].tick
     )
     return row, index, float(start), float(end)
 
@@ -369,7 +354,7 @@ def _signal_advice(experiment: Experiment, modelled: tuple[int, Array]) -> str:
     row, model = modelled
     name, lsb = CULPRIT_SIGNALS[row], experiment.channels[1 + row].grain
     measured = (experiment.spool, experiment.pressure)[row]
-    since = _frozen_since(measured, model, lsb, round(FIT.min_frozen_s / experiment.tick))
+    since = _frozen_since(measured, model, lsb, round(RECORDING.max_sample_gap_s / experiment.tick))
     if since is not None:
         return (
             f"the {name} sensor stands still from {since * experiment.tick:.1f} s on: "
@@ -377,7 +362,7 @@ def _signal_advice(experiment: Experiment, modelled: tuple[int, Array]) -> str:
         )
     seen = np.isfinite(measured) & np.isfinite(model)
     one, other = measured[seen] - measured[seen].mean(), model[seen] - model[seen].mean()
-    if float(one @ other) < FIT.max_reversed_gain * float(other @ other):
+    if float(one @ other) < -RESPONSE.min_gain * float(other @ other):
         return f"the {name} sensor reads with the wrong sign, or the torque motor is reversed"
     return ""
 
@@ -396,11 +381,10 @@ def _frozen_since(measured: Array, model: Array, lsb: float, least: int) -> int 
     if seen.size < least:
         return None
     back = measured[seen][::-1]
-    wide = (
-        np.maximum.accumulate(back) - np.minimum.accumulate(back) > FIT.max_frozen_range_lsb * lsb
-    )
+    still = RESPONSE.max_still_lsb * lsb
+    wide = np.maximum.accumulate(back) - np.minimum.accumulate(back) > still
     count = int(wide.argmax()) if wide.any() else len(back)
-    if count < least or float(np.ptp(model[seen[-count:]])) < FIT.min_modelled_range_lsb * lsb:
+    if count < least or float(np.ptp(model[seen[-count:]])) <= still:
         return None
     return int(seen[-count])
 
@@ -428,7 +412,8 @@ def _temperature_error(value: float, environment: Environment) -> float:
     """By how many kelvin the oil is warmer than its probe says, for that error of viscosity."""
     probe = environment.oil_temperature
     probe = REFERENCE_TEMPERATURE if probe is None else probe
-    grid = np.linspace(-54.0, 135.0, 379)
+    low, high = RECORDING.oil_temperature_range_degc
+    grid = np.arange(low, high + 1.0)
     viscosity = np.array([relative_viscosity(float(t)) for t in grid])
     wanted = (1.0 + value) * relative_viscosity(probe)
     return float(np.interp(-wanted, -viscosity, grid)) - probe

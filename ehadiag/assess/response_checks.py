@@ -18,13 +18,22 @@ from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import ESTIMATION, FIT, RESPONSE
+from ehadiag.core.criteria import (
+    ESTIMATION,
+    FIT_ITERATIONS,
+    LOSSES,
+    NOISE_LIMIT,
+    READINGS,
+    RECORDING,
+    RESPONSE,
+    ROUNDS,
+    STD_OF_MEDIAN_SIZE,
+)
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
 from ehadiag.model.batch import NO_ANCHOR
 from ehadiag.model.residual_models import ModelResponse, model_response
-from firmware_iface.recording import CHANNELS
 
 
 def identified_response(experiment: Experiment, identification: Identification) -> ModelResponse:
@@ -43,28 +52,6 @@ def identified_response(experiment: Experiment, identification: Identification) 
         measured=experiment.spool - offset,
         anchor=experiment.anchor(ANCHOR_THRESHOLDS_LSB) if guessed else NO_ANCHOR,
     )
-
-
-class DelayRegression(msgspec.Struct, frozen=True):
-    """Regression of delays, and fit of the position sensor."""
-
-    rounding_ticks: float = 0.15
-    """Distance from a whole number of ticks up to which a delay is one, ticks: of frames it always
-    is."""
-    travel_ticks: int = 20
-    """Span of the jack's travel, ticks: its position drifts from the model's."""
-    max_residual_stds: float = 4.0
-    """Largest residual of the regression, in deviations: noise alone exceeds it in six of a hundred
-    thousand samples."""
-    corrections: int = 3
-    """Largest number of corrections, 1."""
-    regressions: int = 5
-    """Number of regressions, 1, each without the outliers of the one before."""
-    fit_iterations: int = 8
-    """Iterations of the position sensor's robust fit, 1."""
-
-
-DELAYS = DelayRegression()
 
 
 class Delay(msgspec.Struct, frozen=True):
@@ -87,15 +74,18 @@ def estimate_delays(experiment: Experiment, found: Identification) -> tuple[Dela
     return (
         _delay("spool", experiment.spool, model.spool),
         _delay("pressure", experiment.pressure, model.pressure),
-        _delay("position", _travel(experiment.position), _travel(model.position)),
+        _delay(
+            "position",
+            _travel(experiment, experiment.position),
+            _travel(experiment, model.position),
+        ),
     )
 
 
 def any_significant_delay(delays: Sequence[Delay]) -> bool:
     """Whether a delay is large and certain enough to be corrected."""
     return any(
-        abs(item.value) > max(RESPONSE.min_delay_ticks, RESPONSE.min_delay_stds * item.std)
-        for item in delays
+        abs(item.value) > max(RESPONSE.whole_tick, NOISE_LIMIT * item.std) for item in delays
     )
 
 
@@ -113,7 +103,7 @@ def correct_delays(
     first, best = experiments, found
     total = [estimate_delays(item, found) for item in experiments]
     notes: tuple[str, ...] = ()
-    for _ in range(DELAYS.corrections):
+    for _ in range(ROUNDS):
         if not any(map(any_significant_delay, total)):
             break
         moved = [shift_samples(item, own) for item, own in zip(first, total, strict=True)]
@@ -158,7 +148,7 @@ def delay_note(delays: Sequence[Delay], tick: float) -> str:
 
 def _advanced(values: Array, ticks: float) -> Array:
     """Values a number of ticks later; NaN where one of two neighbours is missing."""
-    near = abs(ticks - round(ticks)) < DELAYS.rounding_ticks
+    near = abs(ticks - round(ticks)) < RESPONSE.whole_tick
     whole = round(ticks) if near else math.floor(ticks)
     part = 0.0 if near else ticks - whole
     moved = _moved(values, whole)
@@ -174,8 +164,9 @@ def _moved(values: Array, ticks: int) -> Array:
     return out
 
 
-def _travel(position: Array) -> Array:
-    return position[DELAYS.travel_ticks :] - position[: -DELAYS.travel_ticks]
+def _travel(experiment: Experiment, position: Array) -> Array:
+    span = round(RESPONSE.travel_span_s / experiment.tick)
+    return position[span:] - position[:-span]
 
 
 def _delay(name: str, measured: Array, modelled: Array) -> Delay:
@@ -183,8 +174,8 @@ def _delay(name: str, measured: Array, modelled: Array) -> Delay:
     left = measured - modelled
     used = np.isfinite(left)
     value, std = 0.0, np.inf
-    for _ in range(DELAYS.regressions):
-        if used.sum() < RESPONSE.min_delay_samples or not np.ptp(slope[used]):
+    for _ in range(FIT_ITERATIONS):
+        if used.sum() < RECORDING.min_samples or not np.ptp(slope[used]):
             return Delay(name, 0.0, np.inf)
         middle = slope[used].mean()
         centred = slope[used] - middle
@@ -192,14 +183,10 @@ def _delay(name: str, measured: Array, modelled: Array) -> Delay:
         value = -float(centred @ left[used]) / power
         away = left + value * slope
         away = away - np.nanmean(away[used])
-        spread = 1.4826 * float(np.nanmedian(np.abs(away)))
+        spread = STD_OF_MEDIAN_SIZE * float(np.nanmedian(np.abs(away)))
         std = spread / float(np.sqrt(power))
-        used = np.isfinite(left) & (np.abs(away) <= DELAYS.max_residual_stds * spread)
+        used = np.isfinite(left) & (np.abs(away) <= ESTIMATION.cauchy_scale * spread)
     return Delay(name, float(value), std * float(np.sqrt(ESTIMATION.correlation_lags)))
-
-
-TRAVEL_SPAN_S = 0.1
-"""Span over which measured and modelled travel of the jack are compared, s."""
 
 
 class PositionFit(msgspec.Struct, frozen=True):
@@ -210,11 +197,13 @@ class PositionFit(msgspec.Struct, frozen=True):
     drift: float
     """Of measured less modelled position, m/s."""
     rms: float
-    """Of the travels that are left, in units of their noise (not below that of 1 LSB)."""
+    """Of the travels that are left, in units of their noise (not below that of 1 LSB); single bad
+    samples do not count."""
     outliers: float
-    """Share of travels far off."""
-    most_drift: float = RESPONSE.max_position_drift_m_per_s
-    """Drift of a sound sensor at most, m/s."""
+    """Share of travels that are farther off than three times the limit of `rms`."""
+    most_drift: float
+    """Drift of a sound sensor at most, m/s: twice that by an unseen spool offset of the range of a
+    signal that stands still."""
 
 
 def fit_position(
@@ -225,37 +214,34 @@ def fit_position(
     slip_speed: m/s, below which the jack slips in steps that no model foresees: travels with such a
     part are left out.
     """
-    span = round(TRAVEL_SPAN_S / experiment.tick)
-    measured = experiment.position[span:] - experiment.position[:-span]
+    span = round(RESPONSE.travel_span_s / experiment.tick)
+    measured, model = _travel(experiment, experiment.position), modelled.position
     seen = np.isfinite(measured)
-    if seen.mean() < RESPONSE.min_travel_share:
-        return None
-    model = modelled.position
     channels = experiment.channels
     if slip_speed > 0.0:
         slow = slow_ticks(model, channels.position, slip_speed * experiment.tick)
         so_far = np.concatenate([[0], np.cumsum(slow)])
         seen &= so_far[span:-1] == so_far[: -span - 1]
-        if seen.mean() < RESPONSE.min_fast_travel_share:
-            return None
+    if seen.sum() < RECORDING.min_samples:
+        return None
     unit = np.sqrt(2.0) * max(experiment.position_noise, channels.position.lsb)
-    travel = (model[span:] - model[:-span])[seen] / unit
+    travel = _travel(experiment, model)[seen] / unit
     moves = (
         float(np.sqrt(np.mean(travel**2))) * unit
-        >= RESPONSE.min_rms_travel_lsb * channels.position.grain
+        >= RESPONSE.max_still_lsb * channels.position.grain
     )
     columns = [travel, np.ones_like(travel)] if moves else [np.ones_like(travel)]
     values = measured[seen] / unit - (0.0 if moves else travel)
     solution, left = _robust_fit(np.column_stack(columns), values)
     smoothed = np.abs(median_of_three(left))
-    most = np.minimum(left**2, RESPONSE.min_travel_outlier**2)
+    far = ESTIMATION.cauchy_scale * RESPONSE.max_travel_rms
+    offset = RESPONSE.max_still_lsb * channels.spool.grain
     return PositionFit(
         gain=float(solution[0]) if moves else float("nan"),
-        drift=float(solution[-1]) * unit / TRAVEL_SPAN_S,
-        rms=float(np.sqrt(np.mean(most))),
-        outliers=float(np.mean(smoothed > RESPONSE.min_travel_outlier)),
-        most_drift=RESPONSE.max_position_drift_m_per_s
-        * (channels.spool.full_scale / CHANNELS.spool.full_scale),
+        drift=float(solution[-1]) * unit / RESPONSE.travel_span_s,
+        rms=float(np.sqrt(np.mean(np.minimum(smoothed, far) ** 2))),
+        outliers=float(np.mean(smoothed > far)),
+        most_drift=2.0 * offset * experiment.constants.GQ / experiment.constants.AJ,
     )
 
 
@@ -265,29 +251,24 @@ def max_position_gain_error(actuator: Actuator) -> float:
     own_effects = calibration is not None and (
         calibration.plays > 1 or has_further_effects(calibration)
     )
-    return (
-        RESPONSE.max_position_gain_error_calibrated
-        if own_effects
-        else RESPONSE.max_position_gain_error
-    )
+    return READINGS.max_channel_ratio_error if own_effects else RESPONSE.max_position_gain_error
 
 
 def objections_to_position(
     fit: PositionFit, max_gain_error: float = RESPONSE.max_position_gain_error
 ) -> list[str]:
     """Reasons why the position sensor is not trusted; max_gain_error: largest error of its gain."""
-    if fit.gain < FIT.max_reversed_gain:
+    if fit.gain < -RESPONSE.min_gain:
         return ["the position sensor reads with the wrong sign"]
-    if fit.gain < RESPONSE.min_position_gain:
+    if fit.gain < RESPONSE.min_gain:
         return ["the position sensor does not follow the jack: dead, frozen, or another signal"]
-    if fit.outliers > RESPONSE.max_travel_outlier_share or fit.rms > RESPONSE.max_travel_rms:
+    if fit.outliers > LOSSES.max_wrong_share or fit.rms > RESPONSE.max_travel_rms:
         return [
-            f"the position sensor does not follow the jack: travel over {TRAVEL_SPAN_S:g} s is "
-            f"off by "
-            f"{fit.rms:.1f} times the noise rms (limit {RESPONSE.max_travel_rms:g}), "
-            f"{fit.outliers:.1%} of it by "
-            f"more than {RESPONSE.min_travel_outlier:g} times (limit "
-            f"{RESPONSE.max_travel_outlier_share:.0%})"
+            "the position sensor does not follow the jack: travel over"
+            f" {RESPONSE.travel_span_s:g} s is off by {fit.rms:.1f} times the noise rms (limit"
+            f" {RESPONSE.max_travel_rms:g}), {fit.outliers:.1%} of it by more than"
+            f" {ESTIMATION.cauchy_scale * RESPONSE.max_travel_rms:g} times (limit"
+            f" {LOSSES.max_wrong_share:.1%})"
         ]
     off = abs(fit.gain - 1.0)
     if off > max_gain_error:
@@ -299,7 +280,7 @@ def objections_to_position(
     if abs(fit.drift) > fit.most_drift:
         return [
             f"the position sensor runs away by {fit.drift * 1e3:.2g} mm/s "
-            f"(limit {fit.most_drift * 1e3:g})"
+            f"(limit {fit.most_drift * 1e3:.2g})"
         ]
     return []
 
@@ -307,7 +288,7 @@ def objections_to_position(
 def _robust_fit(columns: Array, values: Array) -> tuple[Array, Array]:
     """Least squares reweighted by Cauchy's weights: solution and residuals."""
     weight = np.ones_like(values)
-    for _ in range(DELAYS.fit_iterations):
+    for _ in range(FIT_ITERATIONS):
         weighed = columns * weight[:, None]
         solution = np.linalg.pinv(weighed.T @ columns) @ (weighed.T @ values)
         left = values - columns @ solution
@@ -338,11 +319,10 @@ def objections_to_supply(
     for side in (1.0, -1.0):
         got, expected = side * measured[seen], side * modelled.pressure[seen]
         top = float(got.max())
-        flat = RESPONSE.min_pressure_excess_stds * experiment.pressure_noise
-        margin = max(flat, RESPONSE.min_pressure_excess_share * abs(top))
+        margin = RESPONSE.min_pressure_excess_share * abs(top)
         # A peak that is only lower than the model's is none that is cut off.
         cut = (expected > top + margin) & (got > top - margin)
-        if np.count_nonzero(cut) > RESPONSE.max_pressure_excess_ticks:
+        if np.count_nonzero(cut) > 1:  # one tick's peak is a break-away's
             return [
                 f"the pressure stops at {side * top * 1e-6:.2f} MPa where the model goes on to "
                 f"{side * float(expected.max()) * 1e-6:.2f} MPa: supply lower than its probe says,"
@@ -351,24 +331,8 @@ def objections_to_supply(
     return []
 
 
-class StepRules(msgspec.Struct, frozen=True):
-    """Break-aways of the spool in slow ramps."""
-
-    noise_stds: float = 5.0
-    """Least travel in a tick of a break-away, in deviations of the noise of a difference, which
-    alone makes it in six of ten million ticks."""
-    model_share: float = 0.5
-    """The same of the model's, which has no noise, over it, 1."""
-    min_count: int = 6
-    """Least number of steps of a spool that creeps, 1: it breaks away once at each of the turns of
-    the stored test's ramps, of which there are three."""
-    same_size: float = 0.5
-    """Least size of a step that is a break-away of the model's, over the median of these, 1."""
-    min_count_ratio: float = 2.0
-    """Least ratio of that number to the model's break-aways, 1."""
-
-
-STEPS = StepRules()
+TURNS = 3
+"""Turns of the ramps of the stored test in open loop, 1: the spool breaks away once at each."""
 
 
 def spool_steps(spool: Array, least: float) -> Array:
@@ -415,14 +379,15 @@ def creep_note(experiments: Sequence[Experiment], modelled: Sequence[Array]) -> 
     """
     steps, jumps = np.zeros(0), np.zeros(0)
     for item, model in zip(experiments, modelled, strict=True):
-        least = STEPS.noise_stds * math.sqrt(2.0) * item.spool_noise
         for begin, end in () if item.test.closed_loop else item.test.windows.FSS:
             ticks = slice(round(begin / item.tick), round(end / item.tick))
+            least = NOISE_LIMIT * math.sqrt(2.0) * item.spool_noise
             steps = np.concatenate([steps, spool_steps(item.spool[ticks], least)])
-            jumps = np.concatenate([jumps, spool_steps(model[ticks], STEPS.model_share * least)])
-    if len(steps) < max(STEPS.min_count, STEPS.min_count_ratio * len(jumps)):
+            # The model has no noise.
+            jumps = np.concatenate([jumps, spool_steps(model[ticks], 0.5 * least)])
+    if len(steps) < 2.0 * max(len(jumps), TURNS):
         return ""
-    if len(jumps) and (steps > STEPS.same_size * np.median(jumps)).sum() >= len(jumps):
+    if len(jumps) and (steps > 0.5 * np.median(jumps)).sum() >= len(jumps):
         return ""  # it breaks away as the model does
     expected = f"{len(jumps)} break-aways"
     if len(jumps):

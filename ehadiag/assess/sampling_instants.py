@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, FIT_ITERATIONS, LOSSES, STD_OF_MEDIAN_SIZE
 from ehadiag.identify.estimates import interval95
 from ehadiag.identify.experiment import Experiment, unknowns_of
 from ehadiag.identify.identification_result import Identification
@@ -26,44 +26,15 @@ from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import SAMPLING, Acquisition, Recording, sampling_interval, values_at
 
-__all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
-
-
-class InstantRules(msgspec.Struct, frozen=True):
-    """Estimation of sampling instants."""
-
-    rounds: int = 3
-    """Largest number of times that severities and instants are found from one another, 1."""
-    steps: int = 12
-    """Largest number of Gauss-Newton steps, 1."""
-    max_severity_step: float = 0.1
-    """Largest change of a severity in one step, 1."""
-    severity_step: float = 5e-4
-    """Difference of a severity for its derivative, 1."""
-    most_bent: float = 0.5
-    """Most by which the model may leave a line within such differences, in deviations of the noise:
-    the tick of a break-away does."""
-    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1)
-    """Shares of a step that are tried until one explains more, 1."""
-    settled: float = 1e-4
-    """Share of the cost by which a step must lower it to be followed by another, 1."""
-    most_stds: float = 4.0
-    """Largest residual that counts, in deviations of all: noise alone exceeds it in six of a
-    hundred thousand samples."""
-    fits: int = 6
-    """Fits of one step, 1, each without the outliers of the one before."""
-    sufficient_share: float = 0.99
-    """Samples a tick that suffice, 1, but for the clocks: `tools/study daq-recordings`."""
-    max_step_ticks: float = 0.6
-    """Largest change of the instant, ticks: beyond it is another tick."""
-    parts: int = 8
-    """Parts of a tick that the model runs through one by one, 1: within each it is a cubic, and
-    behind a step of the current the flapper takes a fifth of a tick."""
-    instants: int = 2
-    """Instants of each part, 1, at which samples may be: a cubic lies through four of them."""
-
-
-INSTANTS = InstantRules()
+SEVERITY_STEP = 5e-4
+"""Difference of a severity for its derivative, 1: a few deviations of one, so that the model bends
+by less than `MAX_BENT` between break-aways."""
+MAX_BENT = 0.5
+"""Most by which the model may leave a line within such differences, in deviations of the noise,
+which then is more than that: the tick of a break-away does."""
+PARTS = 16
+"""Parts of a tick that the model runs through one by one, 1: a cubic lies through the ends of four
+of them, and behind a step of the current the flapper takes a fifth of a tick."""
 
 
 class _SampledTest(msgspec.Struct, frozen=True, eq=False):
@@ -175,15 +146,10 @@ class _Response:
     """Response of the model within the ticks, in deviations of the noise."""
 
     def __init__(self, taken: _SampledTest, severities: Array) -> None:
-        parts, instants = INSTANTS.parts, INSTANTS.instants
-        self._step = taken.experiment.tick / (parts * instants)
-        runs = np.stack(
-            [taken.response(severities, k * self._step, parts) for k in range(instants)]
-        )
-        # The end of the tick before, the same instants of each part of this one, its end.
-        ends = runs.reshape(instants, 2, -1, parts)
-        grid = np.stack(
-            [ends[k, ..., parts - 1 - part] for part in range(parts) for k in range(instants)]
+        self._step = taken.experiment.tick / PARTS
+        # The ends of the parts from that of this tick back to that of the tick before.
+        grid = np.moveaxis(
+            taken.response(severities, 0.0, PARTS).reshape(2, -1, PARTS)[..., ::-1], 2, 0
         )
         start = np.concatenate([grid[-1:, :, :1], grid[:1, :, :-1]], axis=2)
         self._grid = np.concatenate([grid, start])
@@ -248,7 +214,7 @@ class _Lines(msgspec.Struct, frozen=True, eq=False):
         here = np.stack([fit.model, taken.response(fit.severities, wanted)])
         slopes, bent = [], np.zeros(here.shape)
         for index, value in enumerate(fit.severities.tolist()):
-            step = INSTANTS.severity_step
+            step = SEVERITY_STEP
             middle = min(max(value, step), 1.0 - step)
             points = np.repeat(fit.severities[None], 3, axis=0)
             points[:, index] = middle - step, middle, middle + step
@@ -260,7 +226,7 @@ class _Lines(msgspec.Struct, frozen=True, eq=False):
             )
             slopes.append((high[0] - low[0]) / (2.0 * step))
             bent = np.maximum(bent, np.abs(0.5 * (low + high) - between))
-        return cls(np.stack(slopes), bent.max(axis=0) > INSTANTS.most_bent)
+        return cls(np.stack(slopes), bent.max(axis=0) > MAX_BENT)
 
 
 class _Step(msgspec.Struct, frozen=True):
@@ -296,9 +262,9 @@ def _settled(taken: _SampledTest, start: Mapping[str, float]) -> tuple[Experimen
     fit = _Fit.of(taken, np.array([start[name] for name in FAULT_NAMES]), _Clock())
     lines = _Lines.about(taken, fit)
     step = _step(taken, fit, lines)
-    for _ in range(INSTANTS.steps):
+    for _ in range(FIT_ITERATIONS):
         cost = fit.cost(lines)
-        for share in INSTANTS.shares:
+        for share in (1.0, 0.5, 0.25, 0.125):
             other = _Fit.of(
                 taken,
                 np.clip(fit.severities + share * step.severities, 0.0, 1.0),
@@ -311,8 +277,6 @@ def _settled(taken: _SampledTest, start: Mapping[str, float]) -> tuple[Experimen
             break
         fit, lines = other, _Lines.about(taken, other)
         step = _step(taken, fit, lines)
-        if cost - left < INSTANTS.settled * left:
-            break
     return _placed(taken, fit, lines), step.variance
 
 
@@ -342,7 +306,7 @@ def why_sampled_seldom(recordings: Sequence[Recording]) -> tuple[str, ...]:
         if item is not None and item.acquired is not None
     ]
     for rate, ticks in slow:
-        if rate < INSTANTS.sufficient_share * ticks:
+        if rate < (1.0 - LOSSES.max_wrong_share) * ticks:
             return (
                 f"the acquisition took {rate:.0f} samples a second, and the computer makes"
                 f" {ticks:.0f} ticks: {ticks:.0f} Hz suffice",
@@ -384,21 +348,20 @@ def _step(taken: _SampledTest, fit: _Fit, lines: _Lines) -> _Step:
     used = np.isfinite(left)
     scale = 1.0
     step: Array = np.zeros(table.shape[1])
-    for _ in range(INSTANTS.fits):
+    for _ in range(FIT_ITERATIONS):
         rows = table[used]
         information = rows.T @ rows / scale**2 + np.diag(prior)
         right = rows.T @ left[used] / scale**2 + prior * about
         step = np.asarray(np.linalg.solve(information, right))
         away = np.abs(left - table @ step)
-        scale = max(1.4826 * float(np.nanmedian(away)), 1.0)
-        used = np.isfinite(left) & (away <= INSTANTS.most_stds * scale)
-    most = INSTANTS.max_step_ticks * experiment.tick
+        scale = max(STD_OF_MEDIAN_SIZE * float(np.nanmedian(away)), 1.0)
+        used = np.isfinite(left) & (away <= ESTIMATION.cauchy_scale * scale)
+    most = 0.5 * experiment.tick  # beyond is another tick
     rest = np.delete(np.arange(table.shape[1]), [count, count + 1])
     alone = np.linalg.inv(information[np.ix_(rest, rest)])
     more = np.diag(np.linalg.inv(information))[:count] - np.diag(alone)[:count]
-    farthest = INSTANTS.max_severity_step
     return _Step(
-        np.clip(step[:count], -farthest, farthest),
+        step[:count],
         float(np.clip(step[count], -most, most)),
         float(step[count + 1]),
         np.maximum(more, 0.0),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import FIT, VERDICT
+from ehadiag.core.criteria import FIT, VERDICT, rms_with_outliers
 from firmware_iface.errors import ConfigurationError
 
 if TYPE_CHECKING:  # the command line needs levels and codes long before it loads the compiler
@@ -229,14 +229,7 @@ def residual_limits(calibration: Calibration | None) -> tuple[float, float]:
     further = has_further_effects(calibration)
     if not (further or calibration.fit.left > 0.0):
         return FIT.max_outlier_share, FIT.max_rms
-    fit = calibration.fit
-    outliers = (FIT.outlier_factor_further_effects if further else 1.0) * FIT.max_outlier_share
-    return (
-        min(
-            outliers + FIT.wear_excess_factor * fit.outliers, FIT.max_outlier_share_poor_calibration
-        ),
-        min(
-            FIT.max_rms * FIT.wear_excess_factor * max(fit.spool_rms, fit.pressure_rms),
-            FIT.max_rms_poor_calibration,
-        ),
-    )
+    fit, most = calibration.fit, FIT.max_outlier_share_poor_calibration
+    outliers = FIT.max_outlier_share + FIT.wear_excess_factor * fit.outliers
+    rms = FIT.max_rms * FIT.wear_excess_factor * max(fit.spool_rms, fit.pressure_rms)
+    return most if further else min(outliers, most), min(rms, rms_with_outliers(most))

@@ -19,6 +19,23 @@ NOISE_OUTLIER_SHARE = 2.0 * NormalDist().cdf(-3.0)
 """Share of residuals of noise alone beyond three deviations, 1: 0.0027."""
 NORMAL_HALF_WIDTH_95 = NormalDist().inv_cdf(0.975)
 """Half of the central 95 % of a normal density, in deviations."""
+STD_OF_MEDIAN_SIZE = 1.0 / NormalDist().inv_cdf(0.75)
+"""Deviation of a normal density over the median of its sizes, 1: 1.4826."""
+FALSE_ALARM_CHANCE = 1e-6
+"""Chance that noise alone exceeds a limit in deviations, 1: of a delay, a changed effect, a step of
+the spool in a tick, of which six are needed."""
+NOISE_LIMIT = -NormalDist().inv_cdf(0.5 * FALSE_ALARM_CHANCE)
+"""Deviations that noise alone exceeds by that chance: 4.9."""
+ROUNDS = 3
+"""Times that severities and what they were found from (samples, delays, instants) are found from
+one another at most, 1: each ends sooner where it changes nothing."""
+FIT_ITERATIONS = 8
+"""Iterations of a robust linear fit, 1."""
+
+
+def rms_with_outliers(share: float) -> float:
+    """Rms, in deviations of the noise, of normal residuals with a share beyond three of them."""
+    return 3.0 / -NormalDist().inv_cdf(0.5 * share)
 
 
 class VerdictCriteria(msgspec.Struct, frozen=True):
@@ -43,39 +60,24 @@ class RecordingCriteria(msgspec.Struct, frozen=True):
     """Limits of a recording that can be judged."""
 
     max_frame_delay_s: float = 0.05
-    """Longest delay of a frame after its tick, s; a later one counts as lost. Stamps up to that
-    late left a verdict as it was (docs/reference/bus-faults.md)."""
-    max_missing_share: float = 0.25
-    """Largest share of missing samples of a channel, 1: tried in docs/reference/bus-faults.md."""
-    max_missing_share_without_counter: float = 0.4
-    """Largest share of missing samples on a bus without counters, 1: of two samples a tick late one
-    counts as lost."""
-    max_sample_spacing_ticks: int = 2
-    """Largest regular spacing of samples, ticks: half the control rate suffices for a diagnosis."""
+    """Longest delay of a frame after its tick, s; a later one counts as lost, and a longer span
+    missing at an end of the test is noted. Stamps up to that late left a verdict as it was
+    (docs/reference/bus-faults.md)."""
+    min_sample_share: float = 0.25
+    """Least share of the samples of a test, and of a window for its search, 1: tests of 2000
+    samples are as good with 500."""
     max_sample_gap_s: float = 0.25
     """Longest span without a sample, s: a diagnosis without 0.2 s of the steps stayed the same
     (docs/reference/bus-faults.md)."""
-    min_command_frames: int = 100
-    """Least number of command frames that show the resolution of the command, 1."""
-    min_current_share_without_command: float = 0.4
-    """Least share of ticks with a measured current where the command was not recorded, 1."""
-    min_missing_end_s: float = 0.01
-    """Least span missing at an end of the test that is noted, s; a shorter one is a lost frame."""
-    min_sample_share_of_window: float = 0.25
-    """Least share of the samples of a window for its search, 1: two tests of 2000 samples are as
-    good with 500; of an acquisition up to half is left out, where it sampled edges too seldom."""
-    max_saturated_share: float = 0.02
-    """Largest share of samples at an end of the converter, 1."""
+    min_samples: int = 100
+    """Least number of samples that show a relation, a delay, a gain or the command's resolution, 1:
+    deviations by them are known to 7 %."""
     oil_temperature_range_degc: tuple[float, float] = (-54.0, 135.0)
     """Range of oil temperatures in which the oil's law is used, degC: from MIL-PRF-83282's lowest
     to the usual limit of seals."""
-    min_supply_pressure_share: float = 0.5
-    """Least supply pressure, as a share of that in the actuator file, 1."""
-    max_current_residual_stds: float = 2.0
-    """Largest rms residual of the current, in deviations of the noise: noise alone, whose rms is 1,
-    does not make it."""
     max_control_residual_lsb: float = 4.0
-    """Largest rms residual of the current against the control law, LSB."""
+    """Largest rms residual of the current against the control law, LSB: seven times the noise of
+    a 12-bit channel; of noisier converters as many times theirs."""
 
 
 RECORDING = RecordingCriteria()
@@ -87,23 +89,20 @@ class ReadingCriteria(msgspec.Struct, frozen=True):
     max_reading_factor: float = 10.0
     """Largest reading over what the actuator can reach, 1: no sensor reads more, whatever is wrong
     with it."""
-    min_channel_correlation: float = 0.8
-    """Least correlation of two channels that shows their units, 1."""
+    min_correlation: float = math.sqrt(0.5)
+    """Least correlation of two channels that follow one another, 1: one shows half the variance of
+    the other. Of travel and flow 0.988 at least on 80 sound units with all effects, data 5 % off
+    and orifices, 0.84 with a sensor 50 ms late; 0.33 to -1 with another signal."""
     max_channel_ratio_error: float = 0.25
-    """Largest relative error of the ratio of two channels by faults, load and supply, 1."""
-    min_jack_speed_m_per_s: float = 0.005
-    """Least speed of a moving jack, m/s; below it may stick."""
-    min_moving_ticks: int = 200
-    """Least number of ticks for a relation of two channels, 1."""
-    friction_range_shares: tuple[float, float] = (1.0, 1.2)
-    """Range of the force that moves the jack, over the friction as new and at the limit, 1: viscous
-    friction adds to it."""
-    min_travel_correlation: float = 0.7
-    """Least correlation of the jack's travel with the spool's flow, 1: 0.988 at least on 80 sound
-    units with all effects, data 5 % off and orifices, 0.84 with a sensor 50 ms late; 0.33 to -1
-    with another signal."""
-    max_actuator_ratio_factor: float = 30.0
-    """Largest factor between a ratio of actuator data and its usual value, 1."""
+    """Largest relative error of the ratio of two channels by faults, load and supply, 1; also of
+    the position sensor's gain on a unit calibrated with effects of its own, whose flow gain and
+    jack area may replace what the model leaves out."""
+    min_supply_pressure_share: float = (1.0 - max_channel_ratio_error) ** 2
+    """Least supply pressure, as a share of that in the actuator file, 1: flow gain, which is stated
+    for that, goes with its root."""
+    max_actuator_ratio_factor: float = math.sqrt(1000.0)
+    """Largest factor between a ratio of actuator data and that of the reference actuator, 1: half
+    of a prefix of units, in the logarithm."""
 
 
 READINGS = ReadingCriteria()
@@ -116,17 +115,12 @@ class FitCriteria(msgspec.Struct, frozen=True):
     """Largest share of residuals beyond three deviations for a verdict, 1: five to six times that
     of noise, `NOISE_OUTLIER_SHARE`. Textbook units had 0.0058 at most (`tools/study cube`), with
     1 % of hysteresis more than 0.02 (ADR 4 at 4fd82576)."""
-    max_rms: float = 1.25
-    """Largest rms residual for a verdict, in deviations of the noise."""
-    outlier_factor_further_effects: float = 6.0
-    """Factor on `max_outlier_share` for units with further effects, 1: recorded worn ones had up to
-    8 %, and errors well within their intervals."""
+    max_rms: float = rms_with_outliers(max_outlier_share)
+    """Largest rms residual for a verdict, in deviations of the noise: 1.23, that of normal ones
+    with as many outliers."""
     max_outlier_share_poor_calibration: float = 0.1
     """Largest share of residuals beyond three deviations after whatever calibration, 1: recorded
     worn units whose estimates held had up to 0.08, two that were sure and wrong 0.16 and 0.21."""
-    max_rms_poor_calibration: float = 1.8
-    """Largest rms residual after whatever calibration, in deviations of the noise: normal residuals
-    1.8 times as large as the noise have a tenth beyond three deviations."""
     wear_excess_factor: float = 2.0
     """By which wear may make more of what a model leaves, 1: friction acts on more of it."""
     expected_cauchy_cost: float = 0.8618
@@ -158,22 +152,12 @@ class FitCriteria(msgspec.Struct, frozen=True):
     max_excess_without_nuisances: float = 1.2
     """Largest excess that needs no nuisances, 1: 1.15 at most in 80 recordings of units without
     any."""
-    min_effect_change_stds: float = 6.0
-    """Least change of an effect since the calibration that is noted, in its deviations."""
-    min_effect_change_scales: float = 0.1
-    """Least change of an effect since the calibration that is noted, in units of its scale."""
     min_suspect_share: float = 0.1
-    """Least share of the unexplained cost that a suspect would explain, 1."""
+    """Least share of the unexplained cost that a suspect would explain, 1; also what is left out at
+    either end of the time that is named."""
     min_advice_share: float = 0.6
-    """Least share of the unexplained cost that a suspect explains to be named the cause, 1."""
-    max_frozen_range_lsb: float = 4.0
-    """Largest range of a frozen signal, LSB."""
-    min_modelled_range_lsb: float = 40.0
-    """Least range of the model while a signal is frozen, LSB."""
-    min_frozen_s: float = 0.5
-    """Least time for which a signal is frozen, s."""
-    max_reversed_gain: float = -0.5
-    """Largest gain of a signal against the model with the wrong sign, 1."""
+    """Least share of the unexplained cost that a suspect explains to be named the cause, 1: gain of
+    the spool sensor explained 0.53 to 0.58 of another valve."""
 
 
 FIT = FitCriteria()
@@ -255,76 +239,52 @@ BREAK_AWAYS = BreakAwayRules()
 
 
 class ResponseCriteria(msgspec.Struct, frozen=True):
-    """Limits of position sensor, supply and delays against the identified response."""
+    """Limits of position sensor, supply, delays and still signals against the response."""
 
-    min_travel_share: float = 0.25
-    """Least share of measured travels for a check of the position sensor, 1."""
-    min_fast_travel_share: float = 0.05
-    """The same of travels of a jack that nowhere slips in steps, 1: a quarter of a second."""
-    min_rms_travel_lsb: float = 10.0
-    """Least rms travel over the span for a gain, LSB."""
-    min_position_gain: float = 0.2
-    """Least gain of a position sensor that follows the jack, 1."""
+    travel_span_s: float = 0.1
+    """Span over which travels of the jack are compared, s: velocities of the stored tests, of
+    1 to 10 mm/s in ramps, make three steps of the converter or more of it."""
+    max_still_lsb: float = 4.0
+    """Largest range of a signal that stands still, LSB: 7 deviations of the noise, `noise_lsb`,
+    which is the mean range of 2500 samples of noise."""
+    min_gain: float = 0.5
+    """Least gain of a signal that follows the model, 1; below minus that its sign is wrong: nearer
+    to 1 or -1 than to none."""
     max_position_gain_error: float = 0.1
     """Largest error of the position sensor's gain, 1: twice that of flow gain and jack area 5 %
     off."""
-    max_position_gain_error_calibrated: float = 0.25
-    """The same on a unit calibrated with effects of its own, 1: flow gain and jack area, which the
-    pressure shows by their ratio to others, may replace what the model leaves out."""
-    max_position_drift_m_per_s: float = 0.8e-3
-    """Largest drift of the position sensor, m/s, on a spool of the default range: an unseen spool
-    offset of 1 µm makes half of it."""
     max_travel_rms: float = 4.0
-    """Largest rms residual of the travel, in deviations of its noise: 1.0 to 2.5 on sound units."""
-    min_travel_outlier: float = 12.0
-    """Least residual of an outlier of the travel, in deviations of its noise."""
-    max_travel_outlier_share: float = 0.01
-    """Largest share of outliers of the travel, 1; those of a single bad sample do not count."""
-    min_pressure_excess_stds: float = 10.0
-    """Least excess of the modelled over the largest measured pressure, in deviations of the
-    noise."""
+    """Largest rms residual of the travel, in deviations of its noise: 1.0 to 2.5 on sound units;
+    three times as far a travel is an outlier."""
     min_pressure_excess_share: float = 0.12
     """Least excess of the modelled over the largest measured pressure, as a share of it, 1: a sound
     unit with another law of friction had 10 % for two ticks. Farther below its largest value than
     that share the pressure is not cut off: beside the peak a pressure that the supply cut off was
     2 to 4 % lower, the swing of a sound unit 18 %."""
-    max_pressure_excess_ticks: int = 1
-    """Largest number of ticks with such an excess, 1: one tick in 32 recordings of sound units."""
-    min_delay_ticks: float = 0.05
-    """Least delay of a signal that is corrected, ticks."""
-    min_delay_stds: float = 5.0
-    """Least delay of a signal that is corrected, in its deviations: noise alone makes it in six of
-    ten million cases."""
-    min_delay_samples: int = 100
-    """Least number of samples for a delay, 1."""
+    whole_tick: float = 0.15
+    """Distance from a whole number of ticks up to which a delay is one, ticks: of frames it always
+    is. A smaller delay is none."""
 
 
 RESPONSE = ResponseCriteria()
 
 
 class LossCriteria(msgspec.Struct, frozen=True):
-    """Limits of lost and misplaced samples."""
+    """Limits of lost, misplaced and wrong samples."""
 
-    max_guessed_share: float = 0.015
-    """Largest share of ticks in closed loop with a guessed current, 1:
-    docs/reference/bus-faults.md."""
-    max_guessed_share_reconstructed: float = 0.1
-    """Largest share of guessed currents that is reconstructed, 1: tried with 0.005 to 0.04."""
-    max_guessed_share_observable: float = 0.25
-    """Largest share of guessed currents with which jack friction is estimated, 1: tried up to
-    0.13."""
-    max_out_of_order_share: float = 0.01
-    """Largest share of commands at other ticks than their own, 1."""
+    max_wrong_share: float = FIT.max_outlier_share
+    """Largest share of samples that may be wrong in one way, 1: guessed currents in closed loop,
+    commands at other ticks than their own, samples at the converter's end, readings beyond what the
+    actuator can reach. As many residuals may be outliers (docs/reference/bus-faults.md)."""
+    max_guessed_share: float = 0.13
+    """Largest share of guessed currents that is reconstructed, or with which jack friction is
+    estimated, 1: jack friction was tried up to it, and off by 0.001 at most."""
     min_outlier_share_misplaced: float = 2.0 * NOISE_OUTLIER_SHARE
     """Least share of outliers from which rows placed by time may be misplaced, 1: twice that of
     noise."""
-    max_outlier_share_reconstructed: float = 0.35
-    """Largest share of outliers from which lost samples are reconstructed, 1: up to 0.12 it
-    worked."""
-    min_gain_moved_rows: float = 8.0
-    """Least gain in fit by moving rows, in variances: time and current placed them."""
-    min_gain_lost_position: float = 4.0
-    """Least gain in fit of the best lost position over the second, in variances."""
+    min_gain: float = 2.0 * math.log(FIT.min_likelihood_ratio)
+    """Least gain in fit by moving rows, or of the best lost position over the second, in variances:
+    strong evidence."""
     reconstruction_std: float = 1e-3
     """Standard deviation of a severity that a reconstruction adds, 1: errors up to 0.0014 were
     seen."""

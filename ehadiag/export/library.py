@@ -36,7 +36,7 @@ from ehadiag.compile.worker import (
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, __version__
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.criteria import FIT, RECORDING, VERDICT
+from ehadiag.core.criteria import FIT, LOSSES, READINGS, RECORDING, VERDICT
 from ehadiag.export.targets import (
     Target,
     c_compiler,
@@ -202,10 +202,10 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         search_outliers=max(FIT.max_outliers_of_noise, outliers - FIT.max_outlier_share),
         most_anchored=float(FIT.max_anchor_count),
         most_std=FIT.max_shown_std,
-        most_lost=RECORDING.max_missing_share,
+        most_lost=1.0 - RECORDING.min_sample_share,
         longest_gap=RECORDING.max_sample_gap_s * actuator.controller.rate,
-        most_saturated=RECORDING.max_saturated_share,
-        least_supply=RECORDING.min_supply_pressure_share * valve.PSR,
+        most_saturated=LOSSES.max_wrong_share,
+        least_supply=READINGS.min_supply_pressure_share * valve.PSR,
         **{f"discrepancy_{name}": prior.std.get(name, 0.0) for name in FAULT_LAWS},
         **{f"law_{name}": size for name, size in prior.discrepancy.items()},
         viscosity_std=DAILY_PRIORS["oil_viscosity"].std if calibration else BUS_VISCOSITY_STD,

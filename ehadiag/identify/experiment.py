@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels, conversion_of
-from ehadiag.core.criteria import ANCHORING, ESTIMATION, RECORDING
+from ehadiag.core.criteria import ANCHORING, ESTIMATION
 from ehadiag.identify.signals import (
     QUIET_BLOCK_TICKS,
     CurrentTrace,
@@ -418,7 +418,7 @@ def _mean_of_motion(pressure: Array, test: StoredTest) -> float:
         inside |= (begin < time) & (time <= end)
     seen = pressure[inside & np.isfinite(pressure)]
     needed = sum(end - begin for begin, end in test.windows.refinement) * test.rate
-    return float(seen.mean()) if seen.size > (1.0 - RECORDING.max_missing_share) * needed else 0.0
+    return float(seen.mean()) if seen.size > 0.5 * needed else 0.0
 
 
 def _slides(position: Array, channel: Channel) -> bool:

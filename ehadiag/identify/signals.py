@@ -269,7 +269,7 @@ def _fit_length(command: Array, n: int) -> Array:
 def _resolution(sent: Array) -> float:
     """Smallest distance between two values sent; 0 of too few."""
     levels = np.unique(sent)
-    return 0.0 if levels.size < RECORDING.min_command_frames else float(np.diff(levels).min())
+    return 0.0 if levels.size < RECORDING.min_samples else float(np.diff(levels).min())
 
 
 def _as_sent(stored: Array, resolution: float) -> Array:

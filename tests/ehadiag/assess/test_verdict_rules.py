@@ -149,8 +149,7 @@ def test_what_cannot_carry_a_verdict_is_left_alone(recording):
     samples = recording.samples
     everywhere = np.zeros_like(samples.saturated)
     everywhere[1] = True
-    holed = samples.spool.copy()
-    holed[::3] = np.nan
+    holed = np.where(np.arange(len(samples.spool)) % 5 == 0, samples.spool, np.nan)
     for unfit in (
         replace(recording, environment=Environment(0.0, 0.0, 40.0)),
         replace(recording, environment=Environment(21e6, 0.0, -100.0)),

@@ -95,15 +95,15 @@ def test_limits_are_the_documented_ones() -> None:
     page = (DOCS / "reference" / "verdicts.md").read_text()
     low, high = acceptance.RECORDING.oil_temperature_range_degc
     for limit in (
-        f"missing | {100 * acceptance.RECORDING.max_missing_share:g} % |",
+        f"missing | {100 * (1 - acceptance.RECORDING.min_sample_share):g} % |",
         f"for x s | {acceptance.RECORDING.max_sample_gap_s:g} s |",
-        f"are lost (closed loop) | {100 * lost_samples.LOSSES.max_guessed_share:g} %, see",
-        f"the command too | {acceptance.RECORDING.min_command_frames} frames |",
-        f"at least {1000 * acceptance.RECORDING.min_missing_end_s:g} ms missing",
-        f"converter's end | {100 * acceptance.RECORDING.max_saturated_share:g} % |",
+        f"are lost (closed loop) | {100 * lost_samples.LOSSES.max_wrong_share:g} %, see",
+        f"the command too | {acceptance.RECORDING.min_samples} frames |",
+        f"at least {1000 * acceptance.RECORDING.max_frame_delay_s:g} ms missing",
+        f"converter's end | {100 * lost_samples.LOSSES.max_wrong_share:g} % |",
         f"outside −{-low:g} … {high:g} °C",
         f"more than {100 * FIT.max_outlier_share:g} % of the residuals",
-        f"rms residual above {FIT.max_rms:g} times",
+        f"rms residual above {FIT.max_rms:.3g} times",
     ):
         assert limit in page
 

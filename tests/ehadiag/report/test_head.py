@@ -108,7 +108,7 @@ def test_a_recording_that_was_cut_says_so_first(worn: ehadiag.Result) -> None:
         worn.quality,
         notes=("the last 2.700 s of the test are missing: the recording ends early",),
     )
-    reasons = ("49% of the spool samples are missing (limit 25%)", "no pressure sample for 2.70 s")
+    reasons = ("79% of the spool samples are missing (limit 75%)", "no pressure sample for 2.70 s")
     head = head_of(untested(worn, *reasons, quality=quality), Levels())
     assert head.word == "NOT TESTED"
     assert head.sentences == ("The recording ends early: 2.7 s are missing.",)

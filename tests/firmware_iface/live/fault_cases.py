@@ -356,7 +356,7 @@ too, it is interpolated:
 {CLOSED_LOSSES}
 *Interpolated*: share of ticks. *From truth*: largest distance of an accepted estimate, in stated
 deviations. **Above 1.5 % there is a verdict only where [the response shows the
-positions](../explanation/frames-to-ticks.md#what-cannot-be-observed)**, up to 10 %, and none for a
+positions](../explanation/frames-to-ticks.md#what-cannot-be-observed)**, up to 13 %, and none for a
 controller with an integral or derivative part.
 
 ## What a damaged log does to a diagnosis
