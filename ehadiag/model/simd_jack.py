@@ -224,6 +224,8 @@ def _jack_tick(senses: bool) -> Any:
             j = jack_laws(coefficients, o)
             place, velocity, d, fresh = jacks(state, o)
             done = load(state, ROWS.done * LANES + o) != 0.0
+            law = sensor_laws(coefficients, o)
+            follows = senses and any_lane(law.lag + law.lead > 0.0)
             # From step to step in registers: what is stored in part cannot be loaded at once.
             for step in range(1 << level):
                 k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
@@ -241,7 +243,7 @@ def _jack_tick(senses: bool) -> Any:
                     held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
                     rests = rests & held
                 fine, place0, velocity0 = done | rests, place, velocity
-                if senses and any_lane(rests):
+                if senses and follows and any_lane(rests):
                     x0, x1, x2 = (
                         stage_position(path, o, k + STAGES.start, tick),
                         stage_position(path, o, k, tick),
@@ -289,7 +291,7 @@ def _jack_tick(senses: bool) -> Any:
                             & (travel * fade > JACK_STEPS.fade)
                         )
                     slides = slides & ~coarse & (fresh == 0.0) & moves
-                    if senses and any_lane(slides):
+                    if senses and follows and any_lane(slides):
                         p0 = stage_pressure(
                             j, stage_position(path, o, k + STAGES.start, tick), velocity
                         )
@@ -433,7 +435,8 @@ def _orifice_lane_step(senses: bool) -> Any:
             fits = fits & ~(steep & slow)
             goes = goes & fits
             events = ~(goes | done)
-            if senses:
+            law = sensor_laws(coefficients, o)
+            if senses and any_lane(law.lag + law.lead > 0.0):
                 x0 = stage_position(path, o, k + STAGES.start, tick)
                 x2 = stage_position(path, o, k + STAGES.end, tick)
                 cubic = cubic_through_ends(

@@ -163,8 +163,10 @@ def _orifice_events(senses: bool) -> Any:
         p12, zero = load(state, ROWS.pressure * LANES + o), d * 0.0
         one, creeps = zero + 1.0, any_lane(j.extra > 0.0)
         span = where(mine, span, 1.0)
+        follows = False
         if senses:
-            lag = sensor_laws(coefficients, o).lag
+            sensor = sensor_laws(coefficients, o)
+            follows = any_lane(sensor.lag + sensor.lead > 0.0)
             lagged, seen = (
                 load(state, ROWS.pressure_lagged * LANES + o),
                 load(state, ROWS.pressure_sampled * LANES + o),
@@ -218,7 +220,7 @@ def _orifice_events(senses: bool) -> Any:
                 v = where(events & ~starts, 0.0, v)
                 d = where(events, where(starts, way, 0.0), d)
             moves = goes & ~stays
-            if senses:
+            if senses and follows:
                 h, oil = where(until > q, (until - q) * span, 1.0), oil_at(j, place)
                 cubic = cubic_through_ends(
                     p12, p,
@@ -226,7 +228,7 @@ def _orifice_events(senses: bool) -> Any:
                     h * orifice_rate(j, position_on_piece(piece, until), p, reached, oil),
                 )  # fmt: skip
                 lagged, seen = sample_pressure(
-                    lag, due - q * span, h, moves & (until > q), cubic, lagged, seen
+                    sensor.lag, due - q * span, h, moves & (until > q), cubic, lagged, seen
                 )
             place, p12 = where(moves, there, place), where(moves, p, p12)
             velocity, q = where(moves, v, velocity), where(moves, until, q)
@@ -238,7 +240,7 @@ def _orifice_events(senses: bool) -> Any:
         store_where(state, ROWS.jack_direction * LANES + o, mine, d)
         store_where(state, ROWS.fresh * LANES + o, mine, zero)
         store_where(state, ROWS.pressure * LANES + o, mine, p12)
-        if senses:
+        if senses and follows:
             store_where(state, ROWS.pressure_lagged * LANES + o, mine, lagged)
             store_where(state, ROWS.pressure_sampled * LANES + o, mine, seen)
 
@@ -372,14 +374,15 @@ def _linear_events(senses: bool) -> Any:
         spring, x = j.spring * place, position_on_piece(piece, zero + stop)
         up, down = excess_force(j, x, spring + j.static), excess_force(j, x, spring - j.static)
         rests = goes & (d == 0.0) & (up <= 0.0) & (down >= 0.0)
-        goes = goes & ~rests
+        goes, follows = goes & ~rests, False
         if senses:
             sensor = sensor_laws(coefficients, o)
+            follows = any_lane(sensor.lag + sensor.lead > 0.0)
             lagged, seen = (
                 load(state, ROWS.pressure_lagged * LANES + o),
                 load(state, ROWS.pressure_sampled * LANES + o),
             )
-            if any_lane(rests):
+            if follows and any_lane(rests):
                 lagged, seen = _sensed(
                     creeps, j, sensor, piece, due, rests, zero, zero, zero, q, zero + stop,
                     lagged, seen,
@@ -411,7 +414,7 @@ def _linear_events(senses: bool) -> Any:
             if any_lane(starts):
                 way = where(up > 0.0, one, -one)
                 away = _break_away_share(j, piece, spring + j.static * way, way, q, end, starts)
-                if senses:
+                if senses and follows:
                     lagged, seen = _sensed(
                         creeps, j, sensor, piece, due, starts, zero, zero, zero, q, away,
                         lagged, seen,
@@ -427,7 +430,7 @@ def _linear_events(senses: bool) -> Any:
                 if any_lane(stops):
                     at = _stop_share(creeps, j, piece, hold, velocity, d, later, q, end, stops)
                     there, later = where(stops, at, end), where(stops, 0.0, later)
-            if senses:
+            if senses and follows:
                 way = where(moves & ~(stops & (velocity == 0.0)), d, 0.0)
                 lagged, seen = _sensed(
                     creeps, j, sensor, piece, due, goes, hold, way, velocity, q, there,
@@ -444,7 +447,7 @@ def _linear_events(senses: bool) -> Any:
             q, step = where(ends, end, there), where(ends, step + 1.0, step)
             goes = goes & (step <= count)
         _keep(o, mine, place, velocity, d, fresh, state)
-        if senses:
+        if senses and follows:
             store_where(state, ROWS.pressure_lagged * LANES + o, mine, lagged)
             store_where(state, ROWS.pressure_sampled * LANES + o, mine, seen)
 
