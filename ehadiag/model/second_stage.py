@@ -1,7 +1,7 @@
-"""Second stage and jack over the spool's path: lands, orifices, choice of the stage.
+"""Laws of the second stage over the spool's path: lands, orifices, and the step of a jack behind.
 
 With orifices the pressure is stored in the oil and rings with the jack's mass; the classical Runge-
-Kutta formula of order 4 follows it. Stops and starts are located inside a step.
+Kutta formula of order 4 follows it.
 """
 
 from __future__ import annotations

@@ -98,6 +98,18 @@ def jacks(state: Array, o: int) -> tuple[Vector, Vector, Vector, Vector]:
 
 
 @packed
+def keep_jacks(
+    o: int, mine: Mask, place: Vector, velocity: Vector, d: Vector, fresh: Vector,
+    state: Array,
+) -> None:  # fmt: skip
+    """Write the jack of these lanes."""
+    store_where(state, ROWS.jack * LANES + o, mine, place)
+    store_where(state, ROWS.jack_velocity * LANES + o, mine, velocity)
+    store_where(state, ROWS.jack_direction * LANES + o, mine, d)
+    store_where(state, ROWS.fresh * LANES + o, mine, fresh)
+
+
+@packed
 def limited_pressure(j: JackLaw, p12: Any) -> Any:
     """Pressure within what the supply allows, Pa."""
     return maximum(minimum(p12, j.supply), -j.supply)
@@ -235,10 +247,7 @@ def _orifice_events(senses: bool) -> Any:
             d = where(goes & stays, 0.0, d)
             count = where(events, count + 1.0, where(stays, ORIFICE_STEPS.events * 1.0, 0.0))
             goes = goes & (end - q >= ORIFICE_STEPS.least_share)
-        store_where(state, ROWS.jack * LANES + o, mine, place)
-        store_where(state, ROWS.jack_velocity * LANES + o, mine, velocity)
-        store_where(state, ROWS.jack_direction * LANES + o, mine, d)
-        store_where(state, ROWS.fresh * LANES + o, mine, zero)
+        keep_jacks(o, mine, place, velocity, d, zero, state)
         store_where(state, ROWS.pressure * LANES + o, mine, p12)
         if senses and follows:
             store_where(state, ROWS.pressure_lagged * LANES + o, mine, lagged)
@@ -446,7 +455,7 @@ def _linear_events(senses: bool) -> Any:
             ends = ~stops | (end - there < JACK_STEPS.least_share)
             q, step = where(ends, end, there), where(ends, step + 1.0, step)
             goes = goes & (step <= count)
-        _keep(o, mine, place, velocity, d, fresh, state)
+        keep_jacks(o, mine, place, velocity, d, fresh, state)
         if senses and follows:
             store_where(state, ROWS.pressure_lagged * LANES + o, mine, lagged)
             store_where(state, ROWS.pressure_sampled * LANES + o, mine, seen)
@@ -553,15 +562,3 @@ def jack_over_pieces(
                 )  # fmt: skip
         x0, due = where(span > 0.0, x1, x0), due - span
     store(state, ROWS.done * LANES + o, where(mine, 1.0, load(state, ROWS.done * LANES + o)))
-
-
-@packed
-def _keep(
-    o: int, mine: Mask, place: Vector, velocity: Vector, d: Vector, fresh: Vector,
-    state: Array,
-) -> None:  # fmt: skip
-    """Write the jack of these lanes."""
-    store_where(state, ROWS.jack * LANES + o, mine, place)
-    store_where(state, ROWS.jack_velocity * LANES + o, mine, velocity)
-    store_where(state, ROWS.jack_direction * LANES + o, mine, d)
-    store_where(state, ROWS.fresh * LANES + o, mine, fresh)
