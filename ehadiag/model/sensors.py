@@ -267,16 +267,16 @@ def filter_step(lag: Any, span: Any, upto: Any) -> FilterStep:
     they begin with a series of the last, else with the first. Numbers or vectors.
     """
     u, z = upto / span, maximum(upto, 0.0 * upto) / maximum(lag, SHORTEST_LAG_S)
-    short, fast, by_z = minimum(z, 1.0), z > 1.0, 1.0 / maximum(z, 1.0)
+    short, longer, by_z = minimum(z, 1.0), z > 1.0, 1.0 / maximum(z, 1.0)
     m3 = short / (4.0 + SERIES_TERMS)
     for k in range(SERIES_TERMS):
         m3 = short / (3.0 + SERIES_TERMS - k) * (1.0 - m3)
     m2 = short / 3.0 * (1.0 - m3)
     m1 = short / 2.0 * (1.0 - m2)
-    m0 = where(fast, 1.0 - exp_minus(z), short * (1.0 - m1))
-    m1 = where(fast, 1.0 - by_z * m0, m1)
-    m2 = where(fast, 1.0 - 2.0 * by_z * m1, m2)
-    m3 = where(fast, 1.0 - 3.0 * by_z * m2, m3)
+    m0 = where(longer, 1.0 - exp_minus(z), short * (1.0 - m1))
+    m1 = where(longer, 1.0 - by_z * m0, m1)
+    m2 = where(longer, 1.0 - 2.0 * by_z * m1, m2)
+    m3 = where(longer, 1.0 - 3.0 * by_z * m2, m3)
     return FilterStep(1.0 - m0, m0, u * m1, u * u * m2, u * u * u * m3)
 
 
