@@ -133,7 +133,7 @@ no other beside it."""
 EXCEPTION = re.compile(r'store ptr @"?\.const\.picklebuf[^,]*, ptr')
 """Where a function of numpy that a kernel uses would raise an error: its status says that, too."""
 FAST_MATH_FLAGS = re.compile(
-    r"\b(?:contract|nnan|nsz|ninf|arcp|afn|reassoc|fast) (?=[^\"]*$)", re.M
+    r"(?<!%)\b(?:contract|nnan|nsz|ninf|arcp|afn|reassoc|fast) (?=[^\"]*$)", re.M
 )
 """Leave to round otherwise, to fuse a product and a sum above all: what a compiler makes of it
 depends on the processor, and with it the last digit."""

@@ -175,6 +175,17 @@ def lanes_of(kind: Any, first: int, lanes: int) -> Any:
     return packed(scope["unpack"])
 
 
+def lanes_packer(kind: Any, first: int, lanes: int) -> Any:
+    """Compiled function of an array, a lane and a named tuple of vectors: written from there on."""
+    lines = "".join(
+        f"\n    store(row, {(first + index) * lanes} + lane, value.{name})"
+        for index, name in enumerate(kind._fields)
+    )
+    scope: dict[str, Any] = {"store": store}
+    exec(f"def pack(row, lane, value):{lines}", scope)
+    return packed(scope["pack"])
+
+
 def _compiled(source: str, name: str, kind: Any) -> Any:
     scope: dict[str, Any] = {"kind": kind}
     exec(source, scope)

@@ -1,26 +1,16 @@
-"""Second stage and jack over the spool's path: lands, orifices, choice of the stage.
+"""Laws of the second stage over the spool's path: lands, orifices, and the step of a jack behind.
 
 With orifices the pressure is stored in the oil and rings with the jack's mass; the classical Runge-
-Kutta formula of order 4 follows it. Stops and starts are located inside a step.
+Kutta formula of order 4 follows it.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
-from ehadiag.compile.jit import bare_kernel, inlined
 from ehadiag.compile.vector import absolute, copy_sign, lane_sqrt, maximum, minimum, packed
-from ehadiag.model.jack import linear_piece, sensed_linear_piece
 from ehadiag.model.laws import JackLaw, stribeck_friction
-from ehadiag.model.sensors import (
-    JackState,
-    PathPiece,
-    PressureProbe,
-    cubic_through_ends,
-    position_on_piece,
-    sample_pressure,
-)
+from ehadiag.model.sensors import PathPiece, position_on_piece
 
 MAX_CHAMBER_SHARE = 0.95
 """Largest share of a chamber's volume that the jack's travel takes, 1: what is left at its stop in
@@ -48,8 +38,6 @@ def land_opening_slope(j: JackLaw, x: Any) -> Any:
 @packed
 def land_opening_piece(j: JackLaw, p: PathPiece) -> PathPiece:
     """Path of the lands' opening over a piece of the spool's path."""
-    if j.shaped == 0.0:
-        return p
     rise0, rise1 = land_opening_slope(j, p.x0) * p.rise0, land_opening_slope(j, p.x1) * p.rise1
     return PathPiece(p.span, land_opening(j, p.x0), land_opening(j, p.x1), rise0, rise1)
 
@@ -65,8 +53,6 @@ class OrificeSteps(NamedTuple):
     """Velocity at which a jack no longer creeps, in Stribeck velocities."""
     creep_growth: float = 0.1
     """Largest growth of a creeping jack's velocity within a step, as a power of e, 1."""
-    iterations: int = 40
-    """Largest number of iterations for an event, 1."""
     least_share: float = 1e-7
     """Share of a piece that is neglected, 1."""
     events: int = 16
@@ -74,20 +60,6 @@ class OrificeSteps(NamedTuple):
 
 
 ORIFICE_STEPS = OrificeSteps()
-
-
-class JackEvents(NamedTuple):
-    """Codes of what may end a step of the jack."""
-
-    stop: int = 0
-    """The jack stops."""
-    bound: int = 1
-    """The jack meets its bound."""
-    start: int = 2
-    """The jack breaks away."""
-
-
-JACK_EVENTS = JackEvents()
 
 
 @packed
@@ -183,161 +155,3 @@ def stepped_jack(
 def driving_force(j: JackLaw, place: Any, p12: Any) -> Any:
     """Force on the resting jack but for its friction, N."""
     return j.area * p12 - j.load - j.spring * place
-
-
-@packed
-def _event_distance(
-    j: JackLaw, event: int, d: float, place: float, p12: float, velocity: float
-) -> float:
-    """How far off an event is; negative once it has come."""
-    if event == JACK_EVENTS.stop:
-        return velocity * d
-    if event == JACK_EVENTS.bound:
-        return j.stroke - place * d
-    return j.static - driving_force(j, place, p12) * d
-
-
-@packed
-def _event_share(
-    j: JackLaw, event: int, d: float, p: PathPiece, direction: float, place: float, p12: float,
-    velocity: float, begin: float, end: float,
-) -> float:  # fmt: skip
-    """Share of a piece at which an event comes that has come at `end`; the Illinois rule.
-
-    d: direction that the event is of; direction: of the jack, 0 at rest.
-    """
-    low, high = begin, end
-    at_low = _event_distance(j, event, d, place, p12, velocity)
-    then = stepped_jack(j, p, direction, place, p12, velocity, begin, end)
-    at_high = _event_distance(j, event, d, then[0], then[1], then[2])
-    side = 0
-    for _ in range(ORIFICE_STEPS.iterations):
-        q = high - (high - low) * at_high / (at_high - at_low)
-        then = stepped_jack(j, p, direction, place, p12, velocity, begin, q)
-        value = _event_distance(j, event, d, then[0], then[1], then[2])
-        if value > 0.0:
-            low, at_low = q, value
-            if side == 1:
-                at_high *= 0.5
-            side = 1
-        else:
-            high, at_high = q, value
-            if side == -1:
-                at_low *= 0.5
-            side = -1
-        if high - low < ORIFICE_STEPS.least_share or value == 0.0:
-            break
-    return high
-
-
-@packed
-def _steps(j: JackLaw, span: float, place: float, velocity: float) -> int:
-    """Into how many steps a span (s) is cut."""
-    rate = max(
-        math.sqrt(oil_at(j, place) * j.area * j.by_mass) / ORIFICE_STEPS.ringing,
-        1.0 / ORIFICE_STEPS.longest_s,
-    )
-    if abs(velocity) * j.by_stribeck < ORIFICE_STEPS.creep_limit:
-        # Friction that falls with the velocity drives the jack away.
-        rate = max(rate, j.extra * j.by_stribeck * j.by_mass / ORIFICE_STEPS.creep_growth)
-    return 1 + int(span * rate * (1.0 - 1e-9))
-
-
-def _pieces(senses: bool) -> Any:
-    """Compiled jack over a piece, with or without the sensor of pressure."""
-
-    @bare_kernel
-    def piece(
-        j: JackLaw, probe: PressureProbe, p: PathPiece, begin: float, stop: float, state: JackState
-    ) -> JackState:
-        place, velocity, d, _, p12, lagged, seen = state
-        steps = _steps(j, (stop - begin) * p.span, place, velocity)
-        q, step, events = begin, 1, 0
-        while step <= steps:
-            end = begin + (stop - begin) * step / steps
-            push = driving_force(j, place, p12)
-            bound = abs(place) >= j.stroke and place * push > 0.0
-            if d == 0.0 and abs(push) > j.static and not bound and events < ORIFICE_STEPS.events:
-                d = 1.0 if push > 0.0 else -1.0
-            until = end
-            later = stepped_jack(j, p, d, place, p12, velocity, q, end)
-            event = -1
-            if d == 0.0:
-                now = driving_force(j, later[0], later[1])
-                held = abs(now) <= j.static or (abs(place) >= j.stroke and place * now > 0.0)
-                if not held and events < ORIFICE_STEPS.events:
-                    event, way = JACK_EVENTS.start, 1.0 if now > 0.0 else -1.0
-            elif later[2] * d <= 0.0:
-                event, way = JACK_EVENTS.stop, d
-            elif later[0] * d >= j.stroke:
-                event, way = JACK_EVENTS.bound, d
-            if event >= 0:
-                events += 1
-                if event == JACK_EVENTS.stop and velocity == 0.0:
-                    # It does not get away: at rest for this step.
-                    events, d = ORIFICE_STEPS.events, 0.0
-                else:
-                    until = _event_share(j, event, way, p, d, place, p12, velocity, q, end)
-                later = stepped_jack(j, p, d, place, p12, velocity, q, until)
-            if senses and until > q:
-                h, oil = (until - q) * p.span, oil_at(j, place)
-                cubic = cubic_through_ends(
-                    p12, later[1],
-                    h * orifice_rate(j, position_on_piece(p, q), p12, velocity, oil),
-                    h * orifice_rate(j, position_on_piece(p, until), later[1], later[2], oil),
-                )  # fmt: skip
-                lagged, seen = sample_pressure(probe, cubic, q * p.span, h, lagged, seen)
-            place, p12, velocity = later
-            if event == JACK_EVENTS.stop:
-                velocity, d = 0.0, 0.0
-            elif event == JACK_EVENTS.bound:
-                place, velocity, d = math.copysign(j.stroke, way), 0.0, 0.0
-            elif event == JACK_EVENTS.start:
-                d = way
-            q = until
-            if end - q < ORIFICE_STEPS.least_share:
-                q, step, events = end, step + 1, 0
-        return JackState(place, velocity, d, 0.0, p12, lagged, seen)
-
-    return piece
-
-
-orifice_piece, sensed_orifice_piece = _pieces(False), _pieces(True)
-"""Compiled: jack over the shares begin … stop of a piece; the second one with its sensor."""
-
-
-@bare_kernel
-def _other_piece(
-    j: JackLaw,
-    probe: PressureProbe,
-    senses: bool,
-    p: PathPiece,
-    begin: float,
-    stop: float,
-    state: JackState,
-) -> JackState:
-    """Jack over a piece where it is not the plain one."""
-    if j.oil > 0.0:
-        if senses:
-            return sensed_orifice_piece(j, probe, p, begin, stop, state)
-        return orifice_piece(j, probe, p, begin, stop, state)
-    return sensed_linear_piece(j, probe, p, begin, stop, state)
-
-
-@inlined
-def jack_piece(
-    j: JackLaw,
-    probe: PressureProbe,
-    senses: bool,
-    p: PathPiece,
-    begin: float,
-    stop: float,
-    state: JackState,
-) -> JackState:
-    """Jack over the shares begin … stop of a piece of the spool's path.
-
-    senses: whether the pressure is to be followed as its sensor sees it.
-    """
-    if senses or j.oil > 0.0 or j.extra > 0.0:
-        return _other_piece(j, probe, senses, p, begin, stop, state)
-    return linear_piece(j, probe, p, begin, stop, state)

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ehadiag.compile.jit import inlined
-from ehadiag.compile.vector import maximum, packed
-from ehadiag.model.laws import JackLaw, stribeck_friction
+from ehadiag.compile.vector import Mask, Vector, any_lane, maximum, minimum, packed, where
+from ehadiag.model.laws import JackLaw, exp_minus, stribeck_friction
 from ehadiag.model.plant import PlantConstants
 
 CREEP_ITERATIONS = 3
@@ -178,8 +178,10 @@ def radau_velocity(
 
 MAX_INSTANT_SHARE = 1.0 + 1e-6
 """Share of a piece up to which an instant counts as within it: what rounding may add."""
-MIN_FILTER_SHARE = 1e-3
-"""Share of the filter's time constant in which all that a signal does is its mean."""
+SHORTEST_LAG_S = 1e-30
+"""Time constant of a filter that is none, s: not to divide by 0."""
+SERIES_TERMS = 9
+"""Terms of the series of the filter's last moment, 1: to 1e-9, as `exp_minus`."""
 
 
 class SensorLaw(NamedTuple):
@@ -256,21 +258,26 @@ class FilterStep(NamedTuple):
     """Weights of the cubic's coefficients."""
 
 
-@inlined
-def filter_step(lag: float, span: float, upto: float) -> FilterStep:
-    """Follow a cubic of a duration `span` from its start for `upto` seconds; lag 0: the cubic."""
-    u = upto / span
-    if lag <= 0.0:
-        return FilterStep(0.0, 1.0, u, u * u, u * u * u)
-    keep = math.exp(-upto / lag)
-    m0 = -math.expm1(-upto / lag)
-    if upto < MIN_FILTER_SHARE * lag:
-        return FilterStep(keep, m0, m0 * u / 2.0, m0 * u * u / 3.0, m0 * u * u * u / 4.0)
-    # By parts: the moments of exp((s - upto) / lag) / lag.
-    r = lag / span
-    m1 = u - r * m0
-    m2 = u * u - 2.0 * r * m1
-    return FilterStep(keep, m0, m1, m2, u * u * u - 3.0 * r * m2)
+@packed
+def filter_step(lag: Any, span: Any, upto: Any) -> FilterStep:
+    """Follow a cubic of a duration `span` from its start for `upto` seconds; lag 0: the cubic.
+
+    Weights are u^k times the moments of exp((s - 1) z) z over s^k, 0 < s < 1, with u the share of
+    the span and z of the time constant. Each follows from the next one by parts; with a small z
+    they begin with a series of the last, else with the first. Numbers or vectors.
+    """
+    u, z = upto / span, maximum(upto, 0.0 * upto) / maximum(lag, SHORTEST_LAG_S)
+    short, longer, by_z = minimum(z, 1.0), z > 1.0, 1.0 / maximum(z, 1.0)
+    m3 = short / (4.0 + SERIES_TERMS)
+    for k in range(SERIES_TERMS):
+        m3 = short / (3.0 + SERIES_TERMS - k) * (1.0 - m3)
+    m2 = short / 3.0 * (1.0 - m3)
+    m1 = short / 2.0 * (1.0 - m2)
+    m0 = where(longer, 1.0 - exp_minus(z), short * (1.0 - m1))
+    m1 = where(longer, 1.0 - by_z * m0, m1)
+    m2 = where(longer, 1.0 - 2.0 * by_z * m1, m2)
+    m3 = where(longer, 1.0 - 3.0 * by_z * m2, m3)
+    return FilterStep(1.0 - m0, m0, u * m1, u * u * m2, u * u * u * m3)
 
 
 @packed
@@ -309,25 +316,6 @@ def cubic_through_stages(p0: Any, p1: Any, p2: Any, p3: Any) -> Any:
     )
 
 
-class JackState(NamedTuple):
-    """Jack between two pieces."""
-
-    place: float
-    """m."""
-    velocity: float
-    """m/s."""
-    direction: float
-    """Of its motion, +1 or -1; 0 at rest."""
-    fresh: float
-    """Not 0 if it has just started or stopped."""
-    pressure: float
-    """Differential pressure, Pa; of an orifice stage, where it is stored in the oil."""
-    lagged: float
-    """Differential pressure behind the filter, Pa."""
-    seen: float
-    """The same when it was sampled last, Pa."""
-
-
 class PathPiece(NamedTuple):
     """Piece of the spool's path, a cubic; numbers, or vectors of as many lanes."""
 
@@ -341,16 +329,6 @@ class PathPiece(NamedTuple):
     """Slopes there times `span`, m."""
 
 
-class PressureProbe(NamedTuple):
-    """Sampling of the pressure within a piece."""
-
-    lag: float
-    """Of the filter before its converter, s."""
-    due: float
-    """From the start of the piece to the instant of sampling, s; none of this piece if negative or
-    beyond it."""
-
-
 @packed
 def position_on_piece(p: PathPiece, q: Any) -> Any:
     """Spool at the share q of a piece, m."""
@@ -360,14 +338,17 @@ def position_on_piece(p: PathPiece, q: Any) -> Any:
 
 @packed
 def sample_pressure(
-    probe: PressureProbe, cubic: Any, begin: float, span: float, lagged: float, seen: float
-) -> tuple[float, float]:
-    """Pressure behind the filter after a step, and when it was sampled, Pa.
+    lag: Any, upto: Any, span: Any, these: Mask, cubic: Any, lagged: Any, seen: Any
+) -> tuple[Vector, Vector]:
+    """Pressure behind the filter after a step, and when it was sampled last, Pa, of these lanes.
 
-    cubic: coefficients of the pressure over the step; begin: its start, s from that of the piece;
-    span: s; lagged, seen: before, Pa.
+    lag: see `SensorLaw`; upto: from the start of the step to the instant of sampling, s, none of
+    this step if not positive or beyond it; span: of the step, s; cubic: coefficients of the
+    pressure over it; lagged, seen: before, Pa.
     """
-    upto = probe.due - begin
-    if 0.0 < upto <= MAX_INSTANT_SHARE * span:
-        seen = filter_output(filter_step(probe.lag, span, upto), lagged, cubic)
-    return filter_output(filter_step(probe.lag, span, span), lagged, cubic), seen
+    samples = these & (upto > 0.0) & (upto <= MAX_INSTANT_SHARE * span)
+    if any_lane(samples):
+        at_sampling = filter_output(filter_step(lag, span, upto), lagged, cubic)
+        seen = where(samples, at_sampling, seen)
+    at_end = filter_output(filter_step(lag, span, span), lagged, cubic)
+    return where(these, at_end, lagged), seen

@@ -27,7 +27,6 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.jack import JACK_STEPS
 from ehadiag.model.laws import (
     JackLaw,
     effective_opening,
@@ -56,11 +55,14 @@ from ehadiag.model.sensors import (
     sensor_law,
 )
 from ehadiag.model.simd_jack_pieces import (
-    jack_events,
+    JACK_STEPS,
     jack_over_pieces,
     jacks,
+    limited_pressure,
     linear_step_events,
-    orifice_events,
+    orifice_step_events,
+    sensed_linear_step_events,
+    sensed_orifice_step_events,
 )
 from ehadiag.model.simd_layout import (
     BLOCK,
@@ -173,19 +175,18 @@ def land_opening_lanes(end: int, path: Array, coefficients: Array) -> None:
 
 
 @packed
-def _limited(j: JackLaw, p12: Vector) -> Vector:
-    """Pressure within what the supply allows, Pa."""
-    return maximum(minimum(p12, j.supply), -j.supply)
-
-
-@packed
 def _sense(
     j: JackLaw, these: Mask, level: int, step: int, o: int,
     p0: Vector, p1: Vector, p2: Vector, p3: Vector,
     state: Array, coefficients: Array,
 ) -> None:  # fmt: skip
     """Follow the pressure of these lanes through their filters, from start and stages of a step."""
-    cubic = cubic_through_stages(_limited(j, p0), _limited(j, p1), _limited(j, p2), _limited(j, p3))
+    cubic = cubic_through_stages(
+        limited_pressure(j, p0),
+        limited_pressure(j, p1),
+        limited_pressure(j, p2),
+        limited_pressure(j, p3),
+    )
     filter_pressure(cubic, these, level, step, o, state, coefficients)
 
 
@@ -212,17 +213,19 @@ def filter_pressure(
 
 def _jack_tick(senses: bool) -> Any:
     """Compiled tick of the jack of all lanes, with or without the sensor of pressure."""
+    step_events = sensed_linear_step_events if senses else linear_step_events
 
     @packed
     def ticks(
-        count: int, end: int, tick: float, level: int, state: Array, path: Array,
-        coefficients: Array,
-    ) -> None:  # fmt: skip
+        end: int, tick: float, level: int, state: Array, path: Array, coefficients: Array
+    ) -> None:
         h = tick / (1 << level)
         for o in range(0, end, VECTOR_WIDTH):
             j = jack_laws(coefficients, o)
             place, velocity, d, fresh = jacks(state, o)
             done = load(state, ROWS.done * LANES + o) != 0.0
+            law = sensor_laws(coefficients, o)
+            follows = senses and any_lane(law.lag + law.lead > 0.0)
             # From step to step in registers: what is stored in part cannot be loaded at once.
             for step in range(1 << level):
                 k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
@@ -240,7 +243,7 @@ def _jack_tick(senses: bool) -> Any:
                     held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
                     rests = rests & held
                 fine, place0, velocity0 = done | rests, place, velocity
-                if senses and any_lane(rests):
+                if senses and follows and any_lane(rests):
                     x0, x1, x2 = (
                         stage_position(path, o, k + STAGES.start, tick),
                         stage_position(path, o, k, tick),
@@ -288,7 +291,7 @@ def _jack_tick(senses: bool) -> Any:
                             & (travel * fade > JACK_STEPS.fade)
                         )
                     slides = slides & ~coarse & (fresh == 0.0) & moves
-                    if senses and any_lane(slides):
+                    if senses and follows and any_lane(slides):
                         p0 = stage_pressure(
                             j, stage_position(path, o, k + STAGES.start, tick), velocity
                         )
@@ -300,18 +303,7 @@ def _jack_tick(senses: bool) -> Any:
                     place, velocity = where(fine, place, place0), where(fine, velocity, velocity0)
                     store(state, ROWS.jack * LANES + o, place)
                     store(state, ROWS.jack_velocity * LANES + o, velocity)
-                    events = ~fine
-                    if senses:
-                        law = sensor_laws(coefficients, o)
-                        plain = (law.lag + law.lead == 0.0) & (j.extra == 0.0)
-                        alone = events & ~plain
-                        if any_lane(alone):
-                            store(state, ROWS.busy * LANES + o, where(alone, 1.0, 0.0))
-                            last = min(o + VECTOR_WIDTH, count)
-                            jack_events(o, last, level, step, tick, state, path, coefficients)
-                        events = events & plain
-                    if any_lane(events):
-                        linear_step_events(o, level, step, tick, events, state, path, coefficients)
+                    step_events(o, level, step, tick, ~fine, state, path, coefficients)
                     place, velocity, d, fresh = jacks(state, o)
             store(state, ROWS.jack * LANES + o, place)
             store(state, ROWS.jack_velocity * LANES + o, velocity)
@@ -333,7 +325,7 @@ def sampled_pressures(end: int, kept: bool, state: Array, path: Array, coefficie
     for o in range(0, end, VECTOR_WIDTH):
         j = jack_laws(coefficients, o)
         x = load(path, (LANE_PATH + LANE_NODES) * LANES + o)
-        p12 = _limited(j, stage_pressure(j, x, load(state, ROWS.jack_velocity * LANES + o)))
+        p12 = limited_pressure(j, stage_pressure(j, x, load(state, ROWS.jack_velocity * LANES + o)))
         if kept:
             law = sensor_laws(coefficients, o)
             p12 = where(j.oil > 0.0, load(state, ROWS.pressure * LANES + o), p12)
@@ -372,7 +364,7 @@ def rest_jack_lanes(
     for o in range(0, end, VECTOR_WIDTH):
         j = jack_laws(coefficients, o)
         store(state, ROWS.jack * LANES + o, place)
-        p12 = _limited(j, stage_pressure(j, land_opening(j, j.load * 0.0 + origin), 0.0))
+        p12 = limited_pressure(j, stage_pressure(j, land_opening(j, j.load * 0.0 + origin), 0.0))
         store(state, ROWS.pressure_lagged * LANES + o, p12)
         store(state, ROWS.pressure * LANES + o, p12)
 
@@ -390,13 +382,13 @@ def orifice_level(tick: float, coefficients: Array) -> int:
 
 def _orifice_lane_step(senses: bool) -> Any:
     """Compiled step of all lanes, with or without the sensor of pressure."""
+    step_events = sensed_orifice_step_events if senses else orifice_step_events
 
     @packed
     def lanes(
         end: int, level: int, step: int, tick: float,
         state: Array, path: Array, coefficients: Array, later: Array,
-    ) -> bool:  # fmt: skip
-        any_busy = False
+    ) -> None:  # fmt: skip
         h = tick / (1 << level)
         k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
         # Apart from what becomes of it: a processor works on all vectors at once.
@@ -443,9 +435,8 @@ def _orifice_lane_step(senses: bool) -> Any:
             fits = fits & ~(steep & slow)
             goes = goes & fits
             events = ~(goes | done)
-            if senses:
-                law = sensor_laws(coefficients, o)
-                events = events & (law.lag + law.lead == 0.0)
+            law = sensor_laws(coefficients, o)
+            if senses and any_lane(law.lag + law.lead > 0.0):
                 x0 = stage_position(path, o, k + STAGES.start, tick)
                 x2 = stage_position(path, o, k + STAGES.end, tick)
                 cubic = cubic_through_ends(
@@ -457,20 +448,7 @@ def _orifice_lane_step(senses: bool) -> Any:
             store(state, ROWS.jack_velocity * LANES + o, where(goes, v, velocity))
             store(state, ROWS.jack * LANES + o, where(goes, place + travel, place))
             if any_lane(events):
-                node, span = (step * LANE_NODES) >> level, tick / LANE_NODES
-                a, begin = node * LANES + o, step * LANE_NODES / (1 << level) - node
-                slope = LANE_PATH_SLOPE * LANES + a
-                orifice_events(
-                    o, where(events, 1.0, 0.0), p12 * 0.0 + span,
-                    load(path, a), load(path, a + LANES),
-                    span * load(path, slope), span * load(path, slope + LANES),
-                    begin, begin + LANE_NODES / (1 << level), state, coefficients,
-                )  # fmt: skip
-                goes = goes | events
-            store(state, ROWS.busy * LANES + o, where(goes | done, 0.0, 1.0))
-            if any_lane(~(goes | done)):
-                any_busy = True
-        return any_busy
+                step_events(o, level, step, tick, events, state, path, coefficients)
 
     return lanes
 
@@ -481,18 +459,11 @@ def _ticks(senses: bool) -> Any:
 
     @bare_kernel
     def ticks(
-        count: int,
-        end: int,
-        tick: float,
-        level: int,
-        state: Array,
-        path: Array,
-        coefficients: Array,
+        end: int, tick: float, level: int, state: Array, path: Array, coefficients: Array,
         later: Array,
-    ) -> None:
+    ) -> None:  # fmt: skip
         for step in range(1 << level):
-            if lanes(end, level, step, tick, state, path, coefficients, later):
-                jack_events(0, count, level, step, tick, state, path, coefficients)
+            lanes(end, level, step, tick, state, path, coefficients, later)
 
     return ticks
 

@@ -20,7 +20,9 @@ from ehadiag.compile.vector import (
     lane_of,
     lane_packer,
     lanes_of,
+    lanes_packer,
     load,
+    minimum,
     packed,
     places,
     store,
@@ -159,11 +161,12 @@ keep_drive_law = lane_packer(DriveLaw, COEFFICIENTS.drive_law, LANES)
 keep_spool_law = lane_packer(SpoolLaw, COEFFICIENTS.spool_law, LANES)
 keep_jack_law = lane_packer(JackLaw, COEFFICIENTS.jack_law, LANES)
 keep_sensor_law = lane_packer(SensorLaw, COEFFICIENTS.sensor_law, LANES)
-keep_full_filter_step = lane_packer(FilterStep, COEFFICIENTS.filter, LANES)
-keep_sampled_filter_step = lane_packer(
+"""Compiled, of an array, a lane and a law: write that lane's."""
+keep_full_filter_steps = lanes_packer(FilterStep, COEFFICIENTS.filter, LANES)
+keep_sampled_filter_steps = lanes_packer(
     FilterStep, COEFFICIENTS.filter + len(FilterStep._fields), LANES
 )
-"""Compiled, of an array, a lane and a law: write that lane's."""
+"""The same of the VECTOR_WIDTH lanes from there."""
 
 
 MAX_TICK_EVENTS = 6
@@ -172,9 +175,9 @@ MAX_EVENT_PIECES = 32
 """Pieces of the path of a lane alone in a tick, 1."""
 
 
-def max_lane_pieces(width: int) -> int:
-    """Pieces of the path that events of a vector of lanes may cut in a tick."""
-    return LANE_NODES + (MAX_TICK_EVENTS + 1) * width
+def max_path_pieces(width: int) -> int:
+    """Pieces of the path that events of a vector of lanes may cut in a tick, together or alone."""
+    return max(LANE_NODES + (MAX_TICK_EVENTS + 1) * width, MAX_EVENT_PIECES)
 
 
 STEP_SHIFTS = (FINEST_LEVEL - 3, FINEST_LEVEL - 6, 0)
@@ -217,10 +220,10 @@ def block_places(lanes: int, start: int = 0) -> BlockPlaces:
     width, halvings = min(lanes, 8), QUARTER_HALVINGS + 1
     moving = lanes * len(STEP_SHIFTS) * MOVING_ROWS * STEPS
     sizes = (
-        LANE_STATE_ROWS * lanes, LANE_PATH_ROWS * lanes + 4 * (MAX_EVENT_PIECES + STEPS),
+        LANE_STATE_ROWS * lanes, LANE_PATH_ROWS * lanes + 4 * STEPS,
         COEFFICIENTS.end * lanes, moving, moving, lanes * len(STEP_SHIFTS) * STUCK_ROWS * STEPS,
         halvings * 16 * lanes, halvings * 16 * lanes, halvings * 4 * lanes,
-        (4 * max_lane_pieces(width) + 1) * width, 9 * 16 * lanes,
+        (4 * max_path_pieces(width) + 1) * width, 9 * 16 * lanes,
     )  # fmt: skip
     return BlockPlaces(*(start + item for item in places(*sizes)))
 
@@ -366,17 +369,20 @@ def _laws(c: PlantConstants, tick: float, i: int, out: Array) -> SpoolLaw:
     return t
 
 
-@inlined
-def _filter(law: SensorLaw, tick: float, i: int, out: Array) -> None:
-    """Write how lane `i` follows its signals before the converters."""
-    due = tick - min(law.lead, tick)
+@packed
+def _filters(tick: float, o: int, out: Array) -> None:
+    """Write how the lanes from `o` follow their signals before the converters, tick: s."""
+    law = sensor_laws(out, o)
+    due = tick - minimum(law.lead, tick)
     for level in range(MAX_JACK_HALVINGS + 1):
-        span = tick / (1 << level)
-        step = max(math.ceil(due / span) - 1, 0)
-        place = level * LANE_FILTER_ROWS * LANES + i
-        keep_full_filter_step(out, place, filter_step(law.lag, span, span))
-        keep_sampled_filter_step(out, place, filter_step(law.lag, span, due - step * span))
-        out[(COEFFICIENTS.filter + LANE_FILTER_ROWS - 1) * LANES + place] = step
+        span, place = tick / (1 << level), level * LANE_FILTER_ROWS * LANES + o
+        samples_in = (COEFFICIENTS.filter + LANE_FILTER_ROWS - 1) * LANES + place
+        for i in range(VECTOR_WIDTH):
+            before = tick - min(sensor_law_of_lane(out, o + i).lead, tick)
+            out[samples_in + i] = max(math.ceil(before / span) - 1, 0)
+        keep_full_filter_steps(out, place, filter_step(law.lag, span, due * 0.0 + span))
+        upto = due - load(out, samples_in) * span
+        keep_sampled_filter_steps(out, place, filter_step(law.lag, span, upto))
 
 
 class BlockTraits(NamedTuple):
@@ -470,8 +476,8 @@ def tabulate_coefficients(address: int, candidates: Array, tick: float) -> Block
     _powers(smallest_ring, 2, STUCK_ROWS, stuck, scratch, quarter, whole)
     _copy(whole[: 4 * LANES], coefficients, COEFFICIENTS.rest * LANES)
     if any_of.senses:
-        for i in range(LANES):
-            _filter(sensor_law(plant_of(candidates[i])), tick, i, coefficients)
+        for o in range(0, LANES, VECTOR_WIDTH):
+            _filters(tick, o, coefficients)
     if any_of.backlash:
         rates[6 * LANES : 7 * LANES] = 0.0
         _smallest(rates, 4, tick, scratch, smallest)

@@ -36,9 +36,7 @@ from ehadiag.model.laws import (
     spool_rest_position,
     with_friction,
 )
-from ehadiag.model.second_stage import jack_piece, land_opening_piece
-from ehadiag.model.sensors import PathPiece, PressureProbe, has_sensor_dynamics
-from ehadiag.model.simd_jack_pieces import keep_lane_jack, lane_jack
+from ehadiag.model.simd_jack_pieces import LANE_FLAGS, PIECE_NUMBERS, jack_over_pieces
 from ehadiag.model.simd_layout import (
     LANE_NODES,
     LANE_PATH,
@@ -52,8 +50,6 @@ from ehadiag.model.simd_layout import (
     STEPS,
     STUCK_ROWS,
     TICK_UNITS,
-    jack_law_of_lane,
-    sensor_law_of_lane,
     spool_law_of_lane,
 )
 from ehadiag.model.simd_spool import SPOOL_LIMITS, held_friction
@@ -67,10 +63,8 @@ from ehadiag.model.spool_events import (
     state_after_event,
 )
 
-EVENT_PIECES_START = LANE_PATH_ROWS * LANES
-"""Behind the rows of the path: pieces (duration in s, place at the end, velocities) …"""
-EVENT_INSTANTS_START = EVENT_PIECES_START + 4 * MAX_EVENT_PIECES
-"""… and flapper, its rate, spool and its rate at the instants of a vector."""
+EVENT_INSTANTS_START = LANE_PATH_ROWS * LANES
+"""Behind the rows of the path: flapper, spool and their rates at the instants of a vector."""
 
 
 @bare_kernel
@@ -84,14 +78,25 @@ def event_ticks(
     moving: Array,
     loose: Array,
     stuck: Array,
+    pieces: Array,
 ) -> None:
     """Flapper and spool of busy lanes, of the first `count`, over a tick with events.
 
     Events are located to tick / 2^`FINEST_LEVEL`. with_jack: whether the jack is to go along.
     """
-    for i in range(count):
-        if state[ROWS.busy * LANES + i] != 0.0:
-            _event_tick(i, tick, with_jack, state, path, coefficients, moving, loose, stuck)
+    for o in range(0, count, VECTOR_WIDTH):
+        most, none = 0, load(state, ROWS.busy * LANES + o) * 0.0
+        for n in range(MAX_EVENT_PIECES):
+            store(pieces, n * PIECE_NUMBERS, none)
+        store(pieces, LANE_FLAGS, none)
+        for i in range(o, min(o + VECTOR_WIDTH, count)):
+            if state[ROWS.busy * LANES + i] != 0.0:
+                cuts = _event_tick(i, tick, state, path, coefficients, moving, loose, stuck, pieces)
+                pieces[LANE_FLAGS + i - o] = cuts
+                most = max(most, cuts)
+        if with_jack and most > 0:
+            flags = load(pieces, LANE_FLAGS)
+            jack_over_pieces(o, flags, most, tick, state, path, coefficients, pieces)
 
 
 class _Instant(NamedTuple):
@@ -237,15 +242,15 @@ def _clamped_instants(
 def _event_tick(
     i: int,
     tick: float,
-    with_jack: bool,
     state: Array,
     path: Array,
     coefficients: Array,
     moving: Array,
     loose: Array,
     stuck: Array,
-) -> None:
-    """Lane `i`."""
+    pieces: Array,
+) -> int:
+    """Lane `i`; returns how many pieces of the path its jack is to go over, 0: as usual."""
     t, unit, deflection = (
         spool_law_of_lane(coefficients, i),
         tick / TICK_UNITS,
@@ -260,7 +265,7 @@ def _event_tick(
         int(state[ROWS.direction * LANES + i]),
         state[ROWS.clamped * LANES + i] != 0.0,
     )
-    from_xs, from_vs, since = s.xs, s.vs, 0
+    from_vs, since = s.vs, 0
     kinks, count = False, 0
     done, level, finest = 0, 0, len(STEP_SHIFTS) - 1
     while done < TICK_UNITS:
@@ -337,21 +342,21 @@ def _event_tick(
                 kinks = kinks or event == EVENTS.stop or (s.direction != 0 and s.vs == 0.0)
             at_node = done & (QUARTER_UNITS - 1) == 0
             if at_node or (switches and count < MAX_EVENT_PIECES - LANE_NODES):
-                o = EVENT_PIECES_START + 4 * count
-                path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, s.xs, from_vs, end_vs
+                o = count * PIECE_NUMBERS + i % VECTOR_WIDTH
+                pieces[o], pieces[o + VECTOR_WIDTH] = since * unit, s.xs
+                pieces[o + 2 * VECTOR_WIDTH], pieces[o + 3 * VECTOR_WIDTH] = from_vs, end_vs
                 from_vs, since = s.vs, 0
                 count += 1
             if at_node:
                 path[(LANE_PATH + done // QUARTER_UNITS) * LANES + i] = s.xs
                 path[(LANE_PATH_SLOPE + done // QUARTER_UNITS) * LANES + i] = s.vs
         level = 0 if fine or steps == whole else level + 1
-    if kinks and with_jack:
-        _jack_over_pieces(i, tick, from_xs, count, state, path, coefficients)
     state[ROWS.flapper * LANES + i], state[ROWS.flapper_rate * LANES + i] = s.xf, s.wf
     state[ROWS.spool * LANES + i], state[ROWS.spool_rate * LANES + i] = s.xs, s.vs
     state[ROWS.wire * LANES + i] = s.wire
     state[ROWS.direction * LANES + i] = s.direction
     state[ROWS.clamped * LANES + i] = 1.0 if s.clamped else 0.0
+    return count if kinks else 0
 
 
 @inlined
@@ -364,23 +369,3 @@ def _event(t: SpoolLaw, s: SpoolState, xf: float, xs: float, vs: float) -> int:
     if abs(xf) >= t.flapper_stop:
         return EVENTS.flapper_stop
     return EVENTS.stop if abs(xs) >= t.stroke else EVENTS.wire_engagement
-
-
-@merged
-def _jack_over_pieces(
-    i: int, tick: float, from_xs: float, count: int, state: Array, path: Array, coefficients: Array
-) -> None:
-    """Jack of lane `i` over the tick, by `count` pieces of the spool's path."""
-    j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
-    sensor = sensor_law_of_lane(coefficients, i)
-    due, senses = tick - min(sensor.lead, tick), has_sensor_dynamics(sensor)
-    for n in range(count):
-        o = EVENT_PIECES_START + 4 * n
-        span = path[o]
-        piece = PathPiece(span, from_xs, path[o + 1], path[o + 2] * span, path[o + 3] * span)
-        piece = land_opening_piece(j, piece)
-        jack = jack_piece(j, PressureProbe(sensor.lag, due), senses, piece, 0.0, 1.0, jack)
-        due -= span
-        from_xs = path[o + 1]
-    keep_lane_jack(jack, state, i)
-    state[ROWS.done * LANES + i] = 1.0

@@ -87,7 +87,6 @@ def _jack_level(path: Array) -> int:
 
 @bare_kernel
 def _other_jack_tick(
-    count: int,
     end: int,
     orifice: bool,
     senses: bool,
@@ -103,11 +102,11 @@ def _other_jack_tick(
     Apart from the plain one, so that this stays as it is.
     """
     if orifice and senses:
-        sensed_orifice_tick(count, end, tick, level, state, path, coefficients, scratch)
+        sensed_orifice_tick(end, tick, level, state, path, coefficients, scratch)
     elif orifice:
-        orifice_tick(count, end, tick, level, state, path, coefficients, scratch)
+        orifice_tick(end, tick, level, state, path, coefficients, scratch)
     else:
-        sensed_jack_tick(count, end, tick, level, state, path, coefficients)
+        sensed_jack_tick(end, tick, level, state, path, coefficients)
 
 
 @merged
@@ -153,6 +152,7 @@ def advance_block(
             block_part(address, BLOCK.moving, BLOCK.loose),
             block_part(address, BLOCK.loose, BLOCK.stuck),
             block_part(address, BLOCK.stuck, BLOCK.slides),
+            block_part(address, BLOCK.pieces, BLOCK.scratch),
         )  # fmt: skip
     if has.senses:
         sample_spool_lanes(end, tick, state, path, coefficients)
@@ -164,10 +164,10 @@ def advance_block(
     if with_jack:
         if has.senses or has.orifice:
             _other_jack_tick(
-                count, end, has.orifice, has.senses, tick, level, state, path, coefficients,
+                end, has.orifice, has.senses, tick, level, state, path, coefficients,
                 block_part(address, BLOCK.scratch, BLOCK.end),
             )  # fmt: skip
         else:
-            jack_tick(count, end, tick, level, state, path, coefficients)
+            jack_tick(end, tick, level, state, path, coefficients)
         sampled_pressures(end, has.senses or has.orifice, state, path, coefficients)
     return level

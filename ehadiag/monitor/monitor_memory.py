@@ -125,8 +125,8 @@ MODEL = block_places(1, MONITOR.model)
 """Places of the parts of a monitor's model in its memory."""
 MONITOR_SIZE: Final = MODEL.end
 """Numbers of a monitor, 1."""
-if MODEL.coefficients - MODEL.path < PLANT_FIELDS:  # see `prepare_monitor_by`
-    raise AssertionError("a unit's constants have no room where a monitor's path will be")
+if MODEL.scratch - MODEL.pieces < PLANT_FIELDS:  # see `prepare_monitor_by`
+    raise AssertionError("a unit's constants have no room where pieces of a path will be")
 
 control_law_of = unpacker(ControlLaw, MONITOR.control_law)
 settings_of = unpacker(MonitorSettings, MONITOR.settings)
@@ -244,8 +244,8 @@ def prepare_monitor_by(
     unit = _unit_of(numbers)
     if not _is_valid(numbers, unit):
         return 1
-    # Until the first tick there is room where its path will be.
-    row = array_at(address + BYTES_PER_NUMBER * MODEL.path, (1, PLANT_FIELDS))
+    # Until the first tick there is room where pieces of the path will be.
+    row = array_at(address + BYTES_PER_NUMBER * MODEL.pieces, (1, PLANT_FIELDS))
     for i in range(PLANT_FIELDS):
         row[0, i] = given[i]
     _make_constants(row[0], numbers, unit)
