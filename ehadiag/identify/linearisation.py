@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.criteria import ESTIMATION, REFINEMENT
+from ehadiag.identify.residual_lines import cross_lines
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
 
@@ -346,7 +347,7 @@ class CoordinateCross(msgspec.Struct, frozen=True, eq=False):
     points: Array
     """Shape (1 + 2 c, k)."""
     offsets: Array
-    """Where on its coordinate the mean and its two points stand, from the mean; shape (c, 3)."""
+    """Where on its coordinate the mean and its two points stand, from their mean; shape (c, 3)."""
 
     @classmethod
     def about(cls, model: Derivatives, density: ParameterDensity) -> CoordinateCross:
@@ -364,28 +365,12 @@ class CoordinateCross(msgspec.Struct, frozen=True, eq=False):
                 above = -0.5 * below
             points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
             offsets[k, 1:] = above, -below
-        return cls(points, offsets)
+        return cls(points, offsets - offsets.mean(axis=1, keepdims=True))
 
     def lines(self, model: Derivatives, runs: Array) -> LinearModel:
         """Fit a line along each coordinate to residuals at the points."""
-        count = len(model.curved)
-        shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
-        # By differences from the middle: what slopes, and, at unit length, what a line through the
-        # three runs of a coordinate does not explain.
-        shares = np.zeros((2 * count, len(runs) - 1))
-        for k, offsets in enumerate(self.offsets):
-            mine = slice(2 * k, 2 * k + 2)
-            along = offsets - offsets.mean()
-            across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
-            shares[k, mine] = (along / (along @ along))[1:]
-            shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
-        differences = flat[1:] - flat[0]
-        out = shares @ differences
         jacobian = model.additive_slopes()
-        jacobian[model.curved] = out[:count].reshape(count, *shape)
-        left = out[count:]
-        scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
-        mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
+        mean, scatter = cross_lines(runs, self.offsets, model.curved, jacobian)
         middle = self.points.mean(axis=0)
         return LinearModel(middle, mean, jacobian, scatter, self.points[0], runs[0])
 
