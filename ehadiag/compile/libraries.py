@@ -52,6 +52,7 @@ LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "search": {
         "ehadiag.model.simd_residuals": ("run_blocks",),
         "ehadiag.model.simd_jack": ("fill_driven_jack_costs",),
+        "ehadiag.identify.residual_lines": ("fill_lines", "fill_sums"),
     },
     "model": {
         "ehadiag.model.simd_residuals": ("run_single", "respond"),
@@ -60,12 +61,11 @@ LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "ehadiag.model.laws": ("fill_control_currents",),
         "ehadiag.identify.compact_ga": ("draw_generation", "update_state"),
     },
-    "lines": {"ehadiag.identify.residual_lines": ("fill_lines", "fill_sums")},
     "simulator": {"ehadiag_sim.plant_dynamics": ("advance_plant",)},
 }
 """Kernels of each library by their modules, the one that takes longest to compile first. A kernel
 in none of them is a library of its own."""
-LANES_OF = {"search": GROUND_LANES, "lines": GROUND_LANES}
+LANES_OF = {"search": GROUND_LANES}
 """Candidates side by side in a library's kernels, where they are more than one."""
 SHIPPED = ("search", "model", "simulator")
 """Libraries that come with the package: all of several kernels."""

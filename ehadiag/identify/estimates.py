@@ -92,7 +92,7 @@ def _meat(slopes: Array, residuals: Array) -> Array:
     count = ESTIMATION.correlation_lags + 1
     score = np.einsum("ksn,sn->kn", slopes, residuals)
     total = np.pad(score.cumsum(axis=1), ((0, 0), (0, count - 1)), mode="edge")
-    total[:, count:] -= total[:, : -count].copy()
+    total[:, count:] -= total[:, :-count].copy()
     return np.asarray(total @ total.T / count)
 
 

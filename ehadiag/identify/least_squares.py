@@ -31,7 +31,6 @@ from ehadiag.identify.posterior import (
     no_interruption,
     search_posterior,
 )
-from ehadiag.identify.residual_lines import weighed_sums
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import ResidualModel
 from ehadiag.model.severities import SEARCH_STDS
@@ -351,7 +350,7 @@ def _last_round_step(
     lower, upper = np.concatenate([model.lower, -free]), np.concatenate([model.upper, free])
     begin = out = np.concatenate([linear.x, np.zeros(len(daily))])
     for _ in range(weighings):
-        sums = weighed_sums(linear.jacobian, linear.residuals, linear.scatter, daily, out - begin)
+        sums = linear.sums(daily, out - begin)
         if settled:
             sums.gradient[:count] = 0.0
         out = bounded_step(begin, sums.normal + prior, sums.gradient, lower, upper)

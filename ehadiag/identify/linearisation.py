@@ -16,10 +16,12 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
+from ehadiag.compile.vector import VECTOR_WIDTH
 from ehadiag.core.criteria import ESTIMATION, REFINEMENT
-from ehadiag.identify.residual_lines import cross_lines
+from ehadiag.identify.residual_lines import fill_lines, fill_sums
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
+from ehadiag.model.simd_layout import aligned_numbers
 
 
 class DifferenceRules(NamedTuple):
@@ -138,7 +140,7 @@ class Derivatives:
             if item.by_rate:
                 change[:] = step * item.std * self._rates(runs[0])
             if item.rows is not None:
-                change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
+                change[[row for row in range(len(change)) if row not in item.rows]] = 0.0
         considered[np.abs(considered) >= DIFFERENCES.max_kink] = 0.0
         considered /= step
         return runs[:count], considered, int(anchored[0])
@@ -232,12 +234,15 @@ class Derivatives:
         return out, smooth
 
     def additive_slopes(self) -> Array:
-        """Derivatives by what is simply added to a signal, 0 by all else, shape (k, signals, N)."""
+        """Derivatives by what is simply added to a signal, shape (k, signals, N); the rows of the
+        `curved` coordinates are left to be filled."""
         weight = self.model.batch.weight
-        out = np.zeros((len(self.estimated), *weight.shape))
+        out = np.empty((len(self.estimated), *weight.shape))
         for j, item in enumerate(self.estimated):
-            if item.adds_to is not None and item.adds_to < len(weight):
-                out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
+            if item.adds_to is not None:
+                out[j] = 0.0
+                if item.adds_to < len(weight):
+                    out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
         return out
 
 
@@ -267,6 +272,20 @@ class ParameterDensity(msgspec.Struct, frozen=True, eq=False):
     c)."""
 
 
+NO_ROWS = np.zeros(0)
+
+
+class WeighedSums(NamedTuple):
+    """Sums of a linear model's samples."""
+
+    normal: Array
+    """Shape (k, k)."""
+    gradient: Array
+    """Shape (k,)."""
+    excess: float
+    """Squares of the residuals over those of noise and scatter alone."""
+
+
 class LinearModel(msgspec.Struct, frozen=True, eq=False):
     """Residuals as a linear function about a point."""
 
@@ -282,6 +301,23 @@ class LinearModel(msgspec.Struct, frozen=True, eq=False):
     """Mean of the density itself; shape (k,)."""
     middle: Array
     """Residuals there; shape (signals, N)."""
+
+    def sums(self, more: Array = NO_ROWS, step: Array | None = None) -> WeighedSums:
+        """Sum all samples, each with less weight where it scatters and where it is large.
+
+        more: further rows of the jacobian; step: shape (k,), from `x` to where it counts whether a
+        residual is large.
+        """
+        count = len(self.x) + len(more)
+        out = np.empty(count * count + count + 2)
+        fill_sums(
+            self.jacobian.ravel(), more.ravel(), self.residuals.ravel(), self.scatter.ravel(),
+            np.zeros(count) if step is None else step, ESTIMATION.cauchy_scale**2,
+            aligned_numbers((count + 2) * VECTOR_WIDTH), aligned_numbers(len(out) * VECTOR_WIDTH),
+            out,
+        )  # fmt: skip
+        normal, gradient = out[: count * count].reshape(count, count), out[count * count : -2]
+        return WeighedSums(normal, gradient, float(out[-2] / out[-1]))
 
 
 def linearised_by_regression(
@@ -370,7 +406,12 @@ class CoordinateCross(msgspec.Struct, frozen=True, eq=False):
     def lines(self, model: Derivatives, runs: Array) -> LinearModel:
         """Fit a line along each coordinate to residuals at the points."""
         jacobian = model.additive_slopes()
-        mean, scatter = cross_lines(runs, self.offsets, model.curved, jacobian)
+        mean, scatter = np.empty((2, *runs.shape[1:]))
+        fill_lines(
+            runs.ravel(), self.offsets.ravel(), model.curved,
+            jacobian.ravel(), scatter.ravel(), mean.ravel(),
+            aligned_numbers(len(runs) * VECTOR_WIDTH),
+        )  # fmt: skip
         middle = self.points.mean(axis=0)
         return LinearModel(middle, mean, jacobian, scatter, self.points[0], runs[0])
 

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.criteria import ESTIMATION, GIVE_UP, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
-from ehadiag.identify.residual_lines import weighed_sums
 
 MIN_GRADIENT_SHARE = 1e-9
 """Share of the largest gradient that counts as none."""
@@ -230,7 +229,7 @@ def _narrowed(
     share: float,
 ) -> tuple[ParameterDensity, float, float]:
     """Density after a share of a round, least ratio of its widths, and step of the whole round."""
-    sums = weighed_sums(linear.jacobian, linear.residuals, linear.scatter)
+    sums = linear.sums()
     normal = sums.normal + information
     gradient = sums.gradient + information @ (linear.x - prior.x)
     curved = model.curved

@@ -6,32 +6,26 @@ those of the same function.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array, kernel
 from ehadiag.compile.vector import VECTOR_WIDTH, load, packed, store
-from ehadiag.core.criteria import ESTIMATION
-from ehadiag.model.simd_layout import aligned_numbers
-
-CAUCHY_VARIANCES: Final = ESTIMATION.cauchy_scale**2
-"""Square of the residual from which Cauchy's cost counts it little, in variances."""
 
 
 @packed
 def add_weighed(
-    slopes: Array, count: int, residual: float, at: float, scatter: float, sums: Array
+    slopes: Array, count: int, residual: float, at: float, scatter: float, large: float, sums: Array
 ) -> None:
     """Add samples to the sums of their lines, each weighted.
 
-    It has less weight where it scatters about its line, and where it is large at the point that the
-    weights are of. slopes: `count` of them for each sample; residual, at, scatter: of each. Sums:
-    lower triangle of the normal matrix, in whole rows, gradient, squares, and what squares would be
-    of noise and scatter alone.
+    A sample has less weight where it scatters about its line, and where its residual is large at
+    the point that weights are of. slopes: `count` of each sample; residual: where the lines are of;
+    at: at that point; large: square of a residual from which Cauchy's cost counts it little. Sums:
+    normal matrix, of which the lower triangle is filled; gradient; squares, and those of noise and
+    scatter alone.
     """
-    weight = 1.0 / (1.0 + scatter + at * at / CAUCHY_VARIANCES)
+    weight = 1.0 / (1.0 + scatter + at * at / large)
     gradient = count * count
     for i in range(count):
         pull = weight * load(slopes, i * VECTOR_WIDTH)
@@ -42,9 +36,15 @@ def add_weighed(
             store(sums, place, load(sums, place) + pull * load(slopes, j * VECTOR_WIDTH))
     place = (gradient + count) * VECTOR_WIDTH
     store(sums, place, load(sums, place) + residual * residual * weight)
-    store(
-        sums, place + VECTOR_WIDTH, load(sums, place + VECTOR_WIDTH) + (1.0 + scatter) * weight
-    )
+    store(sums, place + VECTOR_WIDTH, load(sums, place + VECTOR_WIDTH) + (1.0 + scatter) * weight)
+
+
+@packed
+def mirror(normal: Array, count: int) -> None:
+    """Fill the upper triangle of a normal matrix from the lower one."""
+    for i in range(count):
+        for j in range(i):
+            normal[j * count + i] = normal[i * count + j]
 
 
 @packed
@@ -86,7 +86,11 @@ def fill_lines(
     runs: Array, offsets: Array, curved: NDArray[np.int64],
     jacobian: Array, scatter: Array, mean: Array, work: Array,
 ) -> None:  # fmt: skip
-    """Write slopes, scatter and means of residuals on a cross, all flat; see `cross_lines`."""
+    """Write slopes, scatter and means of residuals on a cross, all flat.
+
+    runs: of the middle, then above and below on each coordinate; offsets: of `line_along` on each;
+    curved: rows of the jacobian that are of the coordinates; work: scratch.
+    """
     samples, count = mean.shape[0], curved.shape[0]
     for k in range(0, samples, VECTOR_WIDTH):
         here = min(VECTOR_WIDTH, samples - k)
@@ -112,10 +116,14 @@ def fill_lines(
 
 @kernel
 def fill_sums(
-    jacobian: Array, more: Array, residuals: Array, scatter: Array, step: Array,
+    jacobian: Array, more: Array, residuals: Array, scatter: Array, step: Array, large: float,
     work: Array, sums: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Write the weighted sums of lines, all flat; see `weighed_sums`."""
+    """Write the weighted sums of lines, all flat, see `add_weighed`.
+
+    jacobian, more: slopes; step: by which the lines move the residuals for the weights; work, sums:
+    scratch.
+    """
     samples, count, total = residuals.shape[0], step.shape[0], out.shape[0]
     known = jacobian.shape[0] // samples
     sums[:] = 0.0
@@ -131,61 +139,10 @@ def fill_sums(
             else:
                 _take(more, (i - known) * samples + k, here, work, i * VECTOR_WIDTH)
             at = at + step[i] * load(work, i * VECTOR_WIDTH)
-        add_weighed(work, count, residual, at, load(work, (count + 1) * VECTOR_WIDTH), sums)
+        add_weighed(work, count, residual, at, load(work, (count + 1) * VECTOR_WIDTH), large, sums)
     for i in range(total):
         out[i] = 0.0
         for lane in range(VECTOR_WIDTH):
             out[i] += sums[i * VECTOR_WIDTH + lane]
+    mirror(out, count)
     out[total - 1] -= float(-samples % VECTOR_WIDTH)  # what is beyond the samples has no scatter
-
-
-def cross_lines(
-    runs: Array, offsets: Array, curved: NDArray[np.int64], jacobian: Array
-) -> tuple[Array, Array]:
-    """Mean and scatter about their lines of residuals on a cross, shape (1 + 2 c, signals, N).
-
-    offsets: see `line_along`, from the mean of the three, shape (c, 3). The slopes are written to
-    the rows `curved` of a jacobian.
-    """
-    mean, scatter = np.empty((2, *runs.shape[1:]))
-    fill_lines(
-        runs.ravel(), offsets.ravel(), curved, jacobian.ravel(), scatter.ravel(), mean.ravel(),
-        aligned_numbers(len(runs) * VECTOR_WIDTH),
-    )  # fmt: skip
-    return mean, scatter
-
-
-class WeighedSums(NamedTuple):
-    """Sums over weighted samples."""
-
-    normal: Array
-    """Shape (k, k)."""
-    gradient: Array
-    """Shape (k,)."""
-    excess: float
-    """Squares of the residuals over those of noise and scatter alone."""
-
-
-NO_ROWS = np.zeros(0)
-
-
-def weighed_sums(
-    jacobian: Array, residuals: Array, scatter: Array, more: Array = NO_ROWS,
-    step: Array | None = None,
-) -> WeighedSums:  # fmt: skip
-    """Sum lines of weighted residuals, see `add_weighed`.
-
-    jacobian: rows of shape (signals, N); more: further rows; step: shape (k,), by which the lines
-    move the residuals for the weights.
-    """
-    count = len(jacobian) + len(more)
-    out = np.empty(count * count + count + 2)
-    fill_sums(
-        jacobian.ravel(), more.ravel(), residuals.ravel(), scatter.ravel(),
-        np.zeros(count) if step is None else step,
-        aligned_numbers((count + 2) * VECTOR_WIDTH), aligned_numbers(len(out) * VECTOR_WIDTH), out,
-    )  # fmt: skip
-    lower = out[: count * count].reshape(count, count)
-    normal = np.tril(lower) + np.tril(lower, -1).T
-    gradient = out[count * count : -2]
-    return WeighedSums(normal, gradient, float(out[-2] / out[-1]))
