@@ -197,7 +197,7 @@ def _fill(
 def _address(value: Array) -> int:
     """Where the numbers of a contiguous array stand: in most a third of the time of numpy's."""
     if value.size and value.flags.writeable:
-        return ctypes.addressof(ctypes.c_char.from_buffer(value))
+        return ctypes.addressof(ctypes.c_char.from_buffer(value.data))
     return int(value.ctypes.data)
 
 

@@ -123,8 +123,9 @@ def refinement_by_lines(
 
     Its residuals are the middle's, moved by the lines where these hold: no run of the model.
     """
-    jacobian = np.where(linear.scatter < ESTIMATION.max_row_scatter, linear.jacobian, 0.0)
-    residuals = linear.middle + np.tensordot(x - linear.at, jacobian, 1)
+    shift = np.tensordot(x - linear.at, linear.jacobian, 1)
+    shift[linear.scatter >= ESTIMATION.max_row_scatter] = 0.0
+    residuals = linear.middle + shift
     # The last round counts re-anchorings and considered parameters.
     considered = np.zeros((0, *residuals.shape))
     return _refinement(model, x, linear, residuals, considered, anchored=0, settled=settled)

@@ -6,6 +6,8 @@ those of the same function.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,7 @@ from ehadiag.compile.vector import VECTOR_WIDTH, load, packed, store
 
 @packed
 def add_weighed(
-    slopes: Array, count: int, residual: float, at: float, scatter: float, large: float, sums: Array
+    slopes: Array, count: int, residual: Any, at: Any, scatter: Any, large: float, sums: Array
 ) -> None:
     """Add samples to the sums of their lines, each weighted.
 
@@ -48,9 +50,7 @@ def mirror(normal: Array, count: int) -> None:
 
 
 @packed
-def line_along(
-    here: float, up: float, down: float, above: float, below: float
-) -> tuple[float, float]:
+def line_along(here: float, up: float, down: float, above: Any, below: Any) -> tuple[Any, Any]:
     """Slope of a line through three residuals, and their squares about it.
 
     here, up, down: where the three are on a coordinate, from the mean of these places; above,
