@@ -52,6 +52,7 @@ LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "search": {
         "ehadiag.model.simd_residuals": ("run_blocks",),
         "ehadiag.model.simd_jack": ("fill_driven_jack_costs",),
+        "ehadiag.identify.residual_lines": ("fill_lines", "fill_sums"),
     },
     "model": {
         "ehadiag.model.simd_residuals": ("run_single", "respond"),

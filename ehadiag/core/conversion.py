@@ -69,7 +69,7 @@ def observed_step(values: NDArray[np.float64]) -> float | None:
         step = float(centred @ (levels - levels.mean())) / float(centred @ centred)
     origin = float(np.median(levels - number * step))
     off = np.abs(levels - origin - number * step) / step
-    return step if float(np.quantile(off, STEPS.share)) <= STEPS.deviation else None
+    return step if float(np.mean(off <= STEPS.deviation)) >= STEPS.share else None
 
 
 class Conversion(NamedTuple):

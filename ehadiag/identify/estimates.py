@@ -88,13 +88,12 @@ def _meat(slopes: Array, residuals: Array) -> Array:
 
     slopes: shape (k, signals, N); residuals: 0 in rows left out, shape (signals, N).
     """
-    score = (slopes * residuals).sum(axis=1)
-    total = score @ score.T
-    for lag in range(1, ESTIMATION.correlation_lags + 1):
-        weight = 1.0 - lag / (ESTIMATION.correlation_lags + 1.0)
-        cross = score[:, lag:] @ score[:, :-lag].T
-        total = total + weight * (cross + cross.T)
-    return np.asarray(total)
+    # Bartlett's weights of lags are those of sums over as many ticks.
+    count = ESTIMATION.correlation_lags + 1
+    score = np.einsum("ksn,sn->kn", slopes, residuals)
+    total = np.pad(score.cumsum(axis=1), ((0, 0), (0, count - 1)), mode="edge")
+    total[:, count:] -= total[:, :-count].copy()
+    return np.asarray(total @ total.T / count)
 
 
 def independent_covariance(parameters: Sequence[Parameter], std: Mapping[str, float]) -> Array:

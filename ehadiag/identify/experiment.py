@@ -22,7 +22,7 @@ from ehadiag.identify.signals import (
     relative_noise,
     rounding_noise,
 )
-from ehadiag.model.batch import NO_ANCHOR, POSITION_ROW, Anchor, Batch
+from ehadiag.model.batch import NO_ANCHOR, Anchor, Batch
 from ehadiag.model.parameter import Parameter, scaled_to_channels
 from ehadiag.model.plant import SLIP_TICKS, PlantConstants, relative_viscosity
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, unit_constants
@@ -515,18 +515,15 @@ def lay_out_spans(
     weight, anchors, origins, places = [], [], [], []
     for index, first, a, b in parts:
         experiment = experiments[index]
-        ticks = np.arange(first, b)
-        held = np.isnan(experiment.pressure[first:b])
-        inside = (ticks >= a) & ((ticks >= experiment.creep_end) | held)
-        on_spool = inside & np.isfinite(experiment.spool[first:b]) & channels[0]
-        on_pressure = inside & np.isfinite(experiment.pressure[first:b]) & channels[1]
-        rows = [on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise]
-        if len(channels) > POSITION_ROW:
-            on_position = (
-                inside & np.isfinite(experiment.position[first:b]) & channels[POSITION_ROW]
-            )
-            rows.append(on_position / experiment.position_noise)
-        weight.append(np.vstack(rows))
+        signals = experiment.spool, experiment.pressure, experiment.position
+        inside = np.arange(first, b) >= a
+        creep = slice(0, max(experiment.creep_end - first, 0))
+        inside[creep] &= np.isnan(experiment.pressure[first:b][creep])
+        rows = [
+            (inside & np.isfinite(values[first:b])) * (counts / noise)
+            for values, noise, counts in zip(signals, experiment.noise, channels, strict=False)
+        ]
+        weight.append(np.array(rows))
         anchor = NO_ANCHOR
         if anchor_lsb is not None:
             anchor = experiment.anchor(anchor_lsb)

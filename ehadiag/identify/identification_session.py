@@ -264,6 +264,8 @@ class IdentificationSession:
     ) -> Identification:
         begin = time.perf_counter()
         experiments, self._latest_digest = self._prepared(experiments), ((), b"")
+        if not self._memory.is_fed:
+            self._latest_start = None
         if self.earlier is not None:
             found_before = self._from_earlier(experiments, self.earlier, begin, progress)
             if found_before is not None:
@@ -437,7 +439,8 @@ class IdentificationSession:
     def _start_residuals(self, experiments: Sequence[Experiment], start: Array) -> StartResiduals:
         """Look at the first parts of the tests; the latest one is kept."""
         until = [first_part_ticks(item) for item in experiments]
-        key = self._first_part_digest(experiments, until, start)
+        is_fed = self._memory.is_fed
+        key = self._first_part_digest(experiments, until, start) if is_fed else start.tobytes()
         if self._latest_start is None or self._latest_start[0] != key:
             self._latest_start = key, start_residuals(experiments, until, severities_by_name(start))
         return self._latest_start[1]

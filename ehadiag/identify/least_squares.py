@@ -28,7 +28,6 @@ from ehadiag.identify.posterior import (
     FEW_UNKNOWNS_SCHEDULE,
     SearchSchedule,
     bounded_step,
-    cauchy_weights,
     no_interruption,
     search_posterior,
 )
@@ -124,8 +123,9 @@ def refinement_by_lines(
 
     Its residuals are the middle's, moved by the lines where these hold: no run of the model.
     """
-    jacobian = np.where(linear.scatter < ESTIMATION.max_row_scatter, linear.jacobian, 0.0)
-    residuals = linear.middle + np.tensordot(x - linear.at, jacobian, 1)
+    shift = np.tensordot(x - linear.at, linear.jacobian, 1)
+    shift[linear.scatter >= ESTIMATION.max_row_scatter] = 0.0
+    residuals = linear.middle + shift
     # The last round counts re-anchorings and considered parameters.
     considered = np.zeros((0, *residuals.shape))
     return _refinement(model, x, linear, residuals, considered, anchored=0, settled=settled)
@@ -225,7 +225,7 @@ def last_round(
     linear = cross.lines(model, runs[:count])
     found = refined_by_step(model, linear, considered, anchored, settled=settled)
     found = _without_jumps(found, linear)
-    step = _last_round_step(model, linear, linear.residuals, considered[:0])[0] - linear.at
+    step = _last_round_step(model, linear, considered[:0])[0] - linear.at
     most = near_spread(found) / FEW_UNKNOWNS_SCHEDULE.width
     rests = bool(np.all(np.abs(step * found.scale)[model.curved] <= most))
     found = replace(found, step=step, converged=settled and rests)
@@ -245,9 +245,7 @@ def refined_by_step(
     considered, anchored: of `Derivatives.at`.
     """
     daily = considered[model.daily]
-    x, shift = _last_round_step(
-        model, linear, linear.residuals, daily, weighings=LAST_ROUND_WEIGHINGS
-    )
+    x, shift = _last_round_step(model, linear, daily, weighings=LAST_ROUND_WEIGHINGS)
     moved = replace(linear, residuals=linear.residuals + shift, middle=linear.middle + shift)
     found = refinement_by_lines(model, x, moved, settled=settled)
     return replace(
@@ -324,8 +322,7 @@ def refined_with_day(model: Derivatives, found: Refinement, linear: LinearModel)
     if not len(found.daily):
         return found
     at = replace(linear, x=found.x, residuals=found.residuals)
-    settled = np.zeros_like(found.residuals)
-    x, shift = _last_round_step(model, at, settled, found.daily, found.information)
+    x, shift = _last_round_step(model, at, found.daily, found.information, settled=True)
     residuals = found.residuals + shift
     return replace(found, x=x, residuals=residuals, cost=capped_cost(residuals))
 
@@ -333,21 +330,20 @@ def refined_with_day(model: Derivatives, found: Refinement, linear: LinearModel)
 def _last_round_step(
     model: Derivatives,
     linear: LinearModel,
-    pulls: Array,
     daily: Array,
     information: Array | None = None,
     *,
     weighings: int = 1,
+    settled: bool = False,
 ) -> tuple[Array, Array]:
     """Point to which residuals lead, each weighted by the linear model, and their shift.
 
-    linear: model about the point; pulls: what of its residuals the estimates have not settled;
-    daily: see `Refinement`, estimated with a density of unit width each; the shift of the residuals
-    is theirs.
+    linear: model about the point; daily: see `Refinement`, estimated with a density of unit width
+    each; the shift of the residuals is theirs; settled: whether the residuals are those of an
+    optimum, but for oil and supply of the day.
     """
-    count, shape = len(linear.x), pulls.shape
-    rows = np.concatenate([linear.jacobian, daily]).reshape(count + len(daily), -1)
-    prior = np.eye(len(rows))
+    count = len(linear.x)
+    prior = np.eye(count + len(daily))
     prior[:count, :count] = REFINEMENT.min_information * np.eye(count)
     if information is not None:
         prior[:count, :count] += information
@@ -355,9 +351,8 @@ def _last_round_step(
     lower, upper = np.concatenate([model.lower, -free]), np.concatenate([model.upper, free])
     begin = out = np.concatenate([linear.x, np.zeros(len(daily))])
     for _ in range(weighings):
-        moved = linear.residuals + ((out - begin) @ rows).reshape(shape)
-        weighed = rows * cauchy_weights(replace(linear, residuals=moved)).ravel()
-        gradient = weighed @ linear.residuals.ravel()
-        gradient[:count] = weighed[:count] @ pulls.ravel()
-        out = bounded_step(begin, weighed @ rows.T + prior, gradient, lower, upper)
-    return out[:count], (out[count:] @ rows[count:]).reshape(shape)
+        sums = linear.sums(daily, out - begin)
+        if settled:
+            sums.gradient[:count] = 0.0
+        out = bounded_step(begin, sums.normal + prior, sums.gradient, lower, upper)
+    return out[:count], np.tensordot(out[count:], daily, 1)

@@ -16,9 +16,12 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
+from ehadiag.compile.vector import VECTOR_WIDTH
 from ehadiag.core.criteria import ESTIMATION, REFINEMENT
+from ehadiag.identify.residual_lines import fill_lines, fill_sums
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
+from ehadiag.model.simd_layout import aligned_numbers
 
 
 class DifferenceRules(NamedTuple):
@@ -137,7 +140,7 @@ class Derivatives:
             if item.by_rate:
                 change[:] = step * item.std * self._rates(runs[0])
             if item.rows is not None:
-                change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
+                change[[row for row in range(len(change)) if row not in item.rows]] = 0.0
         considered[np.abs(considered) >= DIFFERENCES.max_kink] = 0.0
         considered /= step
         return runs[:count], considered, int(anchored[0])
@@ -231,12 +234,15 @@ class Derivatives:
         return out, smooth
 
     def additive_slopes(self) -> Array:
-        """Derivatives by what is simply added to a signal, 0 by all else, shape (k, signals, N)."""
+        """Derivatives by what is simply added to a signal, shape (k, signals, N); the rows of the
+        `curved` coordinates are left to be filled."""
         weight = self.model.batch.weight
-        out = np.zeros((len(self.estimated), *weight.shape))
+        out = np.empty((len(self.estimated), *weight.shape))
         for j, item in enumerate(self.estimated):
-            if item.adds_to is not None and item.adds_to < len(weight):
-                out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
+            if item.adds_to is not None:
+                out[j] = 0.0
+                if item.adds_to < len(weight):
+                    out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
         return out
 
 
@@ -266,6 +272,20 @@ class ParameterDensity(msgspec.Struct, frozen=True, eq=False):
     c)."""
 
 
+NO_ROWS = np.zeros(0)
+
+
+class WeighedSums(NamedTuple):
+    """Sums of a linear model's samples."""
+
+    normal: Array
+    """Shape (k, k)."""
+    gradient: Array
+    """Shape (k,)."""
+    excess: float
+    """Squares of the residuals over those of noise and scatter alone."""
+
+
 class LinearModel(msgspec.Struct, frozen=True, eq=False):
     """Residuals as a linear function about a point."""
 
@@ -281,6 +301,23 @@ class LinearModel(msgspec.Struct, frozen=True, eq=False):
     """Mean of the density itself; shape (k,)."""
     middle: Array
     """Residuals there; shape (signals, N)."""
+
+    def sums(self, more: Array = NO_ROWS, step: Array | None = None) -> WeighedSums:
+        """Sum all samples, each with less weight where it scatters and where it is large.
+
+        more: further rows of the jacobian; step: shape (k,), from `x` to where it counts whether a
+        residual is large.
+        """
+        count = len(self.x) + len(more)
+        out = np.empty(count * count + count + 2)
+        fill_sums(
+            self.jacobian.ravel(), more.ravel(), self.residuals.ravel(), self.scatter.ravel(),
+            np.zeros(count) if step is None else step, ESTIMATION.cauchy_scale**2,
+            aligned_numbers((count + 2) * VECTOR_WIDTH), aligned_numbers(len(out) * VECTOR_WIDTH),
+            out,
+        )  # fmt: skip
+        normal, gradient = out[: count * count].reshape(count, count), out[count * count : -2]
+        return WeighedSums(normal, gradient, float(out[-2] / out[-1]))
 
 
 def linearised_by_regression(
@@ -346,7 +383,7 @@ class CoordinateCross(msgspec.Struct, frozen=True, eq=False):
     points: Array
     """Shape (1 + 2 c, k)."""
     offsets: Array
-    """Where on its coordinate the mean and its two points stand, from the mean; shape (c, 3)."""
+    """Where on its coordinate the mean and its two points stand, from their mean; shape (c, 3)."""
 
     @classmethod
     def about(cls, model: Derivatives, density: ParameterDensity) -> CoordinateCross:
@@ -364,28 +401,17 @@ class CoordinateCross(msgspec.Struct, frozen=True, eq=False):
                 above = -0.5 * below
             points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
             offsets[k, 1:] = above, -below
-        return cls(points, offsets)
+        return cls(points, offsets - offsets.mean(axis=1, keepdims=True))
 
     def lines(self, model: Derivatives, runs: Array) -> LinearModel:
         """Fit a line along each coordinate to residuals at the points."""
-        count = len(model.curved)
-        shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
-        # By differences from the middle: what slopes, and, at unit length, what a line through the
-        # three runs of a coordinate does not explain.
-        shares = np.zeros((2 * count, len(runs) - 1))
-        for k, offsets in enumerate(self.offsets):
-            mine = slice(2 * k, 2 * k + 2)
-            along = offsets - offsets.mean()
-            across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
-            shares[k, mine] = (along / (along @ along))[1:]
-            shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
-        differences = flat[1:] - flat[0]
-        out = shares @ differences
         jacobian = model.additive_slopes()
-        jacobian[model.curved] = out[:count].reshape(count, *shape)
-        left = out[count:]
-        scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
-        mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
+        mean, scatter = np.empty((2, *runs.shape[1:]))
+        fill_lines(
+            runs.ravel(), self.offsets.ravel(), model.curved,
+            jacobian.ravel(), scatter.ravel(), mean.ravel(),
+            aligned_numbers(len(runs) * VECTOR_WIDTH),
+        )  # fmt: skip
         middle = self.points.mean(axis=0)
         return LinearModel(middle, mean, jacobian, scatter, self.points[0], runs[0])
 

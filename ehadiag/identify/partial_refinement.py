@@ -318,8 +318,8 @@ def add_last_part(
         slope = model.trusted_slope(x)
         taken = slope.used & (last.batch.weight > 0.0)
         moved, normal = _last_part_step(x, first, slope, taken, model)
-        step = first.jacobian[:, first.used].T @ (moved - x)
-        if step @ step > GIVE_UP.max_last_part_step**2:
+        step = np.tensordot(moved - x, first.jacobian, 1)
+        if np.vdot(step, step) > GIVE_UP.max_last_part_step**2:
             return None
         std = deviations(first.normal)
         others, evaluations = [x], model.evaluations
@@ -344,11 +344,12 @@ def _last_part_step(
 
     taken: rows that count, shape (signals, n).
     """
-    before, now = first.jacobian[:, first.used], slope.jacobian[:, taken]
-    stands, pulls = before @ first.residuals[first.used], now @ slope.residuals[taken]
+    now = slope.jacobian[:, taken]
+    stands = np.tensordot(first.jacobian, first.residuals, 2)
+    pulls = now @ slope.residuals[taken]
     # At the optimum of the first part the gradient is 0, but into a bound.
     at_bound = (x == model.lower) | (x == model.upper)
-    normal = before @ before.T + now @ now.T + NEAR.min_information * np.eye(len(x))
+    normal = first.normal + now @ now.T + NEAR.min_information * np.eye(len(x))
     gradient = np.where(at_bound, stands, 0.0) + pulls
     return bounded_step(x, normal, gradient, model.lower, model.upper), normal
 

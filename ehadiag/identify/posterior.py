@@ -211,12 +211,6 @@ def cauchy_costs(residuals: Array) -> Array:
     return np.asarray(scale**2 * np.log1p((residuals / scale) ** 2))
 
 
-def cauchy_weights(linear: LinearModel) -> Array:
-    """Weight of each residual: less where it scatters, and less where it is large."""
-    variance = 1.0 + linear.scatter
-    return np.asarray(1.0 / (variance + linear.residuals**2 / ESTIMATION.cauchy_scale**2))
-
-
 def _is_linear(linear: LinearModel) -> bool:
     """Whether nearly all samples follow the line but for their noise."""
     return (
@@ -235,11 +229,9 @@ def _narrowed(
     share: float,
 ) -> tuple[ParameterDensity, float, float]:
     """Density after a share of a round, least ratio of its widths, and step of the whole round."""
-    weights = cauchy_weights(linear).ravel()
-    rows = linear.jacobian.reshape(len(density.x), -1)
-    weighed = rows * weights
-    normal = weighed @ rows.T + information
-    gradient = weighed @ linear.residuals.ravel() + information @ (linear.x - prior.x)
+    sums = linear.sums()
+    normal = sums.normal + information
+    gradient = sums.gradient + information @ (linear.x - prior.x)
     curved = model.curved
     inverse_root = np.linalg.inv(density.root)
     held = REFINEMENT.min_information * np.eye(len(density.x))
@@ -248,10 +240,8 @@ def _narrowed(
     held[np.ix_(curved, curved)] += back * inverse_root.T @ inverse_root
     x = bounded_step(linear.x, normal + held, gradient, model.lower, model.upper)
     # Unexplained residuals widen the density.
-    variance = (1.0 + linear.scatter).ravel()
-    excess = float((linear.residuals.ravel() ** 2 * weights).sum() / (variance * weights).sum())
     spread = np.linalg.inv(normal + held * REFINEMENT.min_information)[np.ix_(curved, curved)]
-    spread *= schedule.width**2 * max(excess, 1.0)
+    spread *= schedule.width**2 * max(sums.excess, 1.0)
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
     least = REFINEMENT.min_linear_ratio if is_linear else schedule.least_ratio

@@ -194,8 +194,10 @@ def first_approximation(inputs: FirstApproximationInputs) -> FirstApproximation:
 
 def _points(unknowns: Unknowns, **severities: Array | float) -> Array:
     """Points in the space of the severities, those not named at 0; shape (n, k)."""
-    columns = [np.asarray(severities.get(item.name, 0.0)) for item in unknowns.free]
-    return np.column_stack(np.broadcast_arrays(*columns))
+    out = np.zeros((max(map(np.size, severities.values())), len(unknowns.free)))
+    for column, item in zip(out.T, unknowns.free, strict=True):
+        column[:] = severities.get(item.name, 0.0)
+    return out
 
 
 class _Counter:

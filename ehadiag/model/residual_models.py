@@ -27,6 +27,11 @@ from ehadiag.model.simd_residuals import (
     run_single,
 )
 
+KEPT_NUMBERS = 4_000_000
+"""Numbers of an array that is freed at once, 1: 32 MB, from then on the largest memory that glibc
+keeps when it is freed. Else each array of residuals is of new pages, a tenth of an estimate."""
+np.empty(KEPT_NUMBERS)
+
 
 class ModelResponse(msgspec.Struct, frozen=True, eq=False):
     """Modelled response of each tick when it is sampled, arrays of shape (n,)."""

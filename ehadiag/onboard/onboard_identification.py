@@ -224,7 +224,7 @@ def pass_tick(address: int, plan: Array, ticks_address: int, ticks: Array, k: in
     elif phase == PHASES.considered:
         add_directions(address)
     elif phase in (PHASES.day, PHASES.last_day):
-        add_day(address, plan, k)
+        add_day(address, plan)
     elif phase == PHASES.search and counts:
         add_costs(address, SEARCH.cap, SEARCH.cap)
     elif counts:

@@ -22,6 +22,7 @@ from ehadiag.monitor.monitor_memory import (
     MONITOR_SIZE,
 )
 from ehadiag.onboard.onboard_memory import (
+    CORRELATED_TICKS,
     DIRECTIONS_OF_PASS,
     ONBOARD,
     ONBOARD_GENES,
@@ -130,6 +131,14 @@ def write_deviations(address: int, plan: Array, unknowns: int, reduced: float) -
             variance + considered + ESTIMATION.discrepancy_std**2 + discrepancy * discrepancy
         )
     return failed
+
+
+@merged
+def scores_at(address: int) -> Array:
+    """Return the pulls of the last ticks, the latest first."""
+    return array_at(
+        address + BYTES_PER_NUMBER * ONBOARD.scores, (CORRELATED_TICKS, ONBOARD_UNKNOWNS)
+    )
 
 
 @merged
@@ -269,18 +278,28 @@ SPOOL_VELOCITY_PLACE = ONBOARD.monitors + MODEL.state + ROWS.spool_rate
 
 
 @inlined_exact
-def _spread_scores(scores: Array, meat: Array, k: int) -> None:
-    """Add a tick's pull to the gradient's covariance, and keep it for the ticks to come."""
-    now = k % (ESTIMATION.correlation_lags + 1)
-    for lag in range(min(k, ESTIMATION.correlation_lags) + 1):
-        weight = 1.0 - lag / (ESTIMATION.correlation_lags + 1.0)
-        then = (k - lag) % (ESTIMATION.correlation_lags + 1)
-        for i in range(scores.shape[1]):
-            for j in range(scores.shape[1]):
-                product = scores[now, i] * scores[then, j]
-                if lag > 0:
-                    product += scores[now, j] * scores[then, i]
-                meat[i, j] += weight * product
+def _begin_scores(scores: Array) -> None:
+    """Keep the pulls of the last ticks, and begin with none of this one."""
+    for i in range(scores.shape[1]):
+        for lag in range(CORRELATED_TICKS - 1, 0, -1):
+            scores[lag, i] = scores[lag - 1, i]
+        scores[0, i] = 0.0
+
+
+@inlined_exact
+def _spread_scores(scores: Array, meat: Array, total: Array) -> None:
+    """Add the pulls of the last ticks to the gradient's covariance; total: scratch.
+
+    Sums over so many ticks weigh pulls that are some ticks apart as
+    `ehadiag.identify.estimates.estimate_covariance` does.
+    """
+    for i in range(scores.shape[1]):
+        total[i] = 0.0
+        for lag in range(CORRELATED_TICKS):
+            total[i] += scores[lag, i]
+        for j in range(i + 1):
+            meat[i, j] += total[i] * total[j] / CORRELATED_TICKS
+            meat[j, i] = meat[i, j]
 
 
 MIN_VARIANCE = 1e-12
@@ -466,6 +485,8 @@ def start_day(address: int, plan_address: int, plan: Array) -> None:
     """Prepare models at a point, and beside it along each severity, viscosity and supply."""
     p, trial = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.trial)
     point, step = unknowns_at(address, ONBOARD.point), unknowns_at(address, ONBOARD.along)
+    for i in range(CORRELATED_TICKS * ONBOARD_UNKNOWNS):
+        p[ONBOARD.scores + i] = 0.0
     for i in range(UNKNOWNS_MATRIX_SIZE):
         p[ONBOARD.meat + i] = p[ONBOARD.normal + i] = 0.0
     for i in range(ONBOARD_UNKNOWNS):
@@ -486,19 +507,14 @@ def start_day(address: int, plan_address: int, plan: Array) -> None:
 
 
 @bare_kernel
-def add_day(address: int, plan: Array, k: int) -> None:
+def add_day(address: int, plan: Array) -> None:
     """Add a tick, to which the models are advanced, to the step of the day."""
     p, slope = array_at(address, (ONBOARD.end,)), unknowns_at(address, ONBOARD.slope)
     normal = square_at(address, ONBOARD.normal, ONBOARD_UNKNOWNS)
     shift = unknowns_at(address, ONBOARD.normal + UNKNOWNS_MATRIX_SIZE)
     pull = unknowns_at(address, ONBOARD.pull)
-    scores = array_at(
-        address + BYTES_PER_NUMBER * ONBOARD.scores,
-        (ESTIMATION.correlation_lags + 1, ONBOARD_UNKNOWNS),
-    )
-    now = k % (ESTIMATION.correlation_lags + 1)
-    for i in range(ONBOARD_UNKNOWNS):
-        scores[now, i] = 0.0
+    scores = scores_at(address)
+    _begin_scores(scores)
     for c in range(2):
         at, noise = ONBOARD.monitors + MONITOR.residual + c, p[ONBOARD.noise + c]
         r = p[at] / noise
@@ -513,13 +529,17 @@ def add_day(address: int, plan: Array, k: int) -> None:
             continue
         lead = _sampling_shift(p, plan) if c == 0 else 0.0
         for i in range(ONBOARD_UNKNOWNS):
-            scores[now, i] += slope[i] * r
+            scores[0, i] += slope[i] * r
             pull[i] += slope[i] * r
             shift[i] += slope[i] * lead
             for j in range(ONBOARD_UNKNOWNS):
                 normal[i, j] += slope[i] * slope[j]
     if p[PROGRESS.phase] == PHASES.last_day:  # by the first step nothing is judged
-        _spread_scores(scores, square_at(address, ONBOARD.meat, ONBOARD_UNKNOWNS), k)
+        _spread_scores(
+            scores,
+            square_at(address, ONBOARD.meat, ONBOARD_UNKNOWNS),
+            unknowns_at(address, ONBOARD.scratch),
+        )
 
 
 @bare_kernel
@@ -532,6 +552,10 @@ def end_day(address: int, plan: Array) -> None:
     normal = square_at(address, ONBOARD.normal, ONBOARD_UNKNOWNS)
     matrix = square_at(address, ONBOARD.scratch, ONBOARD_UNKNOWNS)
     column = unknowns_at(address, ONBOARD.scratch + UNKNOWNS_MATRIX_SIZE)
+    scores, meat = scores_at(address), square_at(address, ONBOARD.meat, ONBOARD_UNKNOWNS)
+    for _ in range(CORRELATED_TICKS - 1 if p[PROGRESS.phase] == PHASES.last_day else 0):
+        _begin_scores(scores)
+        _spread_scores(scores, meat, column)
     point, pull = unknowns_at(address, ONBOARD.point), unknowns_at(address, ONBOARD.pull)
     for i in range(ONBOARD_PARAMETERS):
         pull[i] = 0.0  # the refinement has settled them

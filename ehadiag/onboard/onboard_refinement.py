@@ -15,6 +15,7 @@ from ehadiag.compile.jit import Array, bare_kernel
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE, MANY_UNKNOWNS_SCHEDULE
+from ehadiag.identify.residual_lines import add_weighed, mirror
 from ehadiag.model.parameter import USUAL
 from ehadiag.onboard.onboard_memory import (
     MATRIX_SIZE,
@@ -210,16 +211,18 @@ ROUNDS = RoundRules()
 MOVED_POINT_PLACE = ONBOARD.scratch + 2 * MATRIX_SIZE + ONBOARD_PARAMETERS
 SMALL_MATRICES_PLACE = MOVED_POINT_PLACE + ONBOARD_PARAMETERS
 """Places of what a step works on."""
-LEFT, WEIGHED, JUMPED, COUNTED = range(ONBOARD.sums, ONBOARD.sums + 4)
-"""Sums of a round: unexplained squares and their expectation; samples where the model jumps, and
-all."""
+WEIGHED_SUMS = MATRIX_SIZE + ONBOARD_PARAMETERS + 2
+"""Numbers of `add_weighed`: normal matrix, gradient, unexplained squares and their expectation."""
+LEFT, WEIGHED = ONBOARD.normal + WEIGHED_SUMS - 2, ONBOARD.normal + WEIGHED_SUMS - 1
+JUMPED, COUNTED = ONBOARD.sums, ONBOARD.sums + 1
+"""Sums of a round: samples where the model jumps, and all."""
 
 
 @bare_kernel
 def start_round(address: int, plan_address: int, plan: Array) -> None:
     """Prepare the models of a round over the density, and clear what it adds up."""
     p = array_at(address, (ONBOARD.end,))
-    for i in range(MATRIX_SIZE + ONBOARD_PARAMETERS):
+    for i in range(WEIGHED_SUMS):
         p[ONBOARD.normal + i] = 0.0
     for i in range(SUMS):
         p[ONBOARD.sums + i] = 0.0
@@ -236,27 +239,19 @@ def start_round(address: int, plan_address: int, plan: Array) -> None:
 @bare_kernel
 def add_lines(address: int, ticks: Array, k: int) -> None:
     """Add a tick, to which the models are advanced, to normal matrix and gradient."""
-    p = array_at(address, (ONBOARD.end,))
-    normal = array_at(
-        address + BYTES_PER_NUMBER * ONBOARD.normal, (ONBOARD_PARAMETERS, ONBOARD_PARAMETERS)
-    )
-    gradient = parameters_at(address, ONBOARD.normal + MATRIX_SIZE)
-    slope = parameters_at(address, ONBOARD.slope)
+    p, slope = array_at(address, (ONBOARD.end,)), parameters_at(address, ONBOARD.slope)
+    sums = array_at(address + BYTES_PER_NUMBER * ONBOARD.normal, (WEIGHED_SUMS,))
     along = array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES, 3))
     for channel in range(2):
         if not math.isfinite(ticks[k, 2 + channel]):
             continue
         residual, scatter = fitted_lines(p, channel, along, slope)
-        weight = 1.0 / (1.0 + scatter + residual * residual / ROUNDS.cauchy_variances)
-        p[LEFT] += residual * residual * weight
-        p[WEIGHED] += (1.0 + scatter) * weight
+        add_weighed(
+            slope, ONBOARD_PARAMETERS, residual, residual, scatter, ROUNDS.cauchy_variances, sums
+        )
         p[COUNTED] += 1.0
         if scatter > REFINEMENT.max_linear_scatter:
             p[JUMPED] += 1.0
-        for i in range(ONBOARD_PARAMETERS):
-            gradient[i] += weight * slope[i] * residual
-            for j in range(ONBOARD_PARAMETERS):
-                normal[i, j] += weight * slope[i] * slope[j]
 
 
 @bare_kernel
@@ -345,6 +340,8 @@ def _narrow(address: int, excess: float, least: float, part: float) -> tuple[flo
 def end_round(address: int, done: float) -> tuple[bool, bool]:
     """Step and narrow the density, so many rounds done: whether it was the last, and it settled."""
     p = array_at(address, (ONBOARD.end,))
+    normal = array_at(address + BYTES_PER_NUMBER * ONBOARD.normal, (MATRIX_SIZE,))
+    mirror(normal, ONBOARD_PARAMETERS)
     excess = p[LEFT] / max(p[WEIGHED], 1.0)
     linear = p[JUMPED] < REFINEMENT.max_nonlinear_share * max(p[COUNTED], 1.0)
     most, full, least = ROUNDS.most, ROUNDS.full, ROUNDS.min_ratio

@@ -17,6 +17,7 @@ from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.criteria import ESTIMATION, FIT, REFINEMENT
 from ehadiag.identify.compact_ga import CompactGaState, draw_generation, update_state
+from ehadiag.identify.residual_lines import line_along
 from ehadiag.identify.staged_search import SEARCH_STAGES
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.sensors import read_pressure
@@ -247,22 +248,16 @@ def fitted_lines(p: Array, channel: int, along: Array, slope: Array) -> tuple[fl
     """
     noise, at = p[ONBOARD.noise + channel], ONBOARD.monitors + MONITOR.residual + channel
     middle = p[at] / noise
-    total, scatter = middle, 0.0
+    total, scatter = 0.0, 0.0
     for i in range(ONBOARD_GENES):
-        up = p[at + (1 + 2 * i) * MONITOR_SIZE] / noise
-        down = p[at + (2 + 2 * i) * MONITOR_SIZE] / noise
-        total += up + down
-        a, b, c = along[i, 0], along[i, 1], along[i, 2]
-        slope[i] = (a * middle + b * up + c * down) / (a * a + b * b + c * c)
-        mean = (middle + up + down) / 3.0
-        scatter += (
-            (middle - mean - a * slope[i]) ** 2
-            + (up - mean - b * slope[i]) ** 2
-            + (down - mean - c * slope[i]) ** 2
-        )
+        above = p[at + (1 + 2 * i) * MONITOR_SIZE] / noise - middle
+        below = p[at + (2 + 2 * i) * MONITOR_SIZE] / noise - middle
+        total += above + below
+        slope[i], part = line_along(along[i, 0], along[i, 1], along[i, 2], above, below)
+        scatter += part
     slope[ONBOARD_GENES] = slope[ONBOARD_GENES + 1] = 0.0
     slope[ONBOARD_GENES + channel] = -1.0 / noise
-    return total / ONBOARD_MODELS, scatter / ONBOARD_GENES
+    return middle + total / ONBOARD_MODELS, scatter / ONBOARD_GENES
 
 
 ROOT_OF_SIX = math.sqrt(6.0)

@@ -24,9 +24,13 @@ from ehadiag.identify.least_squares import (
     refinement_at,
     rest_near,
 )
-from ehadiag.identify.linearisation import ParameterDensity, capped_cost, linearised_on_cross
+from ehadiag.identify.linearisation import (
+    LinearModel,
+    ParameterDensity,
+    capped_cost,
+    linearised_on_cross,
+)
 from ehadiag.identify.partial_refinement import anchored_derivatives, free_run_residuals
-from ehadiag.identify.posterior import cauchy_weights
 from ehadiag.model.registry import FAULT_NAMES, parameter
 from ehadiag.model.registry import FAULTS as SEVERITIES
 from ehadiag.model.residual_models import SimdModel
@@ -215,7 +219,27 @@ def test_an_optimum_of_many_unknowns_moves_by_the_oil_of_the_day():
     found = refinement_at(whole(), before.x, linear, settled=True)
     after = refined_with_day(whole(), found, linear)
     assert np.abs(error(after)).max() < 0.5 * np.abs(error(before)).max()
-    rows = linear.jacobian.reshape(len(found.x), -1)
-    held = 1e9 * (rows * cauchy_weights(linear).ravel()) @ rows.T
+    held = 1e9 * linear.sums().normal
     known = refined_with_day(whole(), replace(found, information=held), linear)
     np.testing.assert_allclose(known.x, found.x, atol=1e-9)
+
+
+@pytest.mark.parametrize("samples", [3, 8, 21])
+def test_sums_of_lines_are_those_of_weighted_samples(samples):
+    """Also of fewer samples than a vector holds; further rows count where the step leads."""
+    rng = np.random.default_rng(samples)
+    jacobian, more = rng.standard_normal((4, 2, samples)), rng.standard_normal((1, 2, samples))
+    residuals, scatter = 3.0 * rng.standard_normal((2, samples)), rng.random((2, samples))
+    step = rng.standard_normal(5)
+    linear = LinearModel(np.zeros(4), residuals, jacobian, scatter, np.zeros(4), residuals)
+    rows = np.concatenate([jacobian, more]).reshape(5, -1)
+    for further, shift in ((more, step), (more[:0], None)):
+        mine = rows[: 4 + len(further)]
+        at = residuals.ravel() + (0.0 if shift is None else shift @ mine)
+        variance = 1.0 + scatter.ravel()
+        weights = 1.0 / (variance + at**2 / ESTIMATION.cauchy_scale**2)
+        sums = linear.sums(further, shift)
+        np.testing.assert_allclose(sums.normal, (mine * weights) @ mine.T, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(sums.gradient, (mine * weights) @ residuals.ravel(), atol=1e-11)
+        expected = (residuals.ravel() ** 2 * weights).sum() / (variance * weights).sum()
+        assert sums.excess == pytest.approx(expected, rel=1e-12)
