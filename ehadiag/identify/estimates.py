@@ -176,28 +176,18 @@ def calibrated_explanation_test(fit: FitQuality) -> ExplanationTest:
     )
 
 
-def is_unexplainable(
-    residuals: Array, starts: int, *, astray: bool = False, soon: bool = False
-) -> bool:
-    """Whether so much is left after so many starts that further ones will not explain it.
+def is_unexplainable(residuals: Array) -> bool:
+    """Whether a search has left what no further start will explain.
 
-    astray: whether a search may well end away from the optimum; soon: whether the spool shows that.
+    Half of all samples are beyond three deviations, or the spool is explained and the pressure is
+    not: where a search ends between break-aways it is the spool that jumps.
     """
-    most = GIVE_UP.outliers_closed_loop if astray else GIVE_UP.outliers
-    outliers = residual_outlier_share(residuals)
-    if outliers > most[min(starts, len(most)) - 1]:
-        return True
-    if starts < 2 and not (astray and soon):
-        return False
-    spool, *others = signal_excess_costs(residuals)
-    pressure = max(others, default=0.0)
-    if not astray:
-        return max(spool, pressure) > GIVE_UP.excess
-    if pressure > max(spool, GIVE_UP.excess) and (starts > 1 or spool <= GIVE_UP.excess):
-        return outliers > GIVE_UP.pressure_outliers[min(starts, 2) - 1]
-    return starts > 1 and spool > (
-        GIVE_UP.excess if 0.0 < pressure <= FIT.max_explained_excess else GIVE_UP.spool_excess
-    )
+    return residual_outlier_share(residuals) > GIVE_UP.outliers or misses_only_pressure(residuals)
+
+
+def misses_only_pressure(residuals: Array) -> bool:
+    """Whether the spool is explained, and the pressure is not."""
+    return explains_spool(residuals) and excess_cost(residuals) > FIT.max_explained_excess
 
 
 def explains_spool(residuals: Array) -> bool:
@@ -207,18 +197,12 @@ def explains_spool(residuals: Array) -> bool:
 
 def is_near(residuals: Array) -> bool:
     """Whether so little is left that it may be of break-aways at wrong ticks."""
-    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
-
-
-def misses_only_pressure(residuals: Array) -> bool:
-    """Whether the spool is explained, and the pressure is not."""
-    return explains_spool(residuals) and excess_cost(residuals) > FIT.max_explained_excess
+    return residual_outlier_share(residuals) <= GIVE_UP.near_outliers
 
 
 def is_pressure_misfit(residuals: Array) -> bool:
     """Whether the spool, where break-aways happen, is explained and the pressure is far from it."""
-    spool, pressure = signal_excess_costs(residuals)[:2]
-    return spool <= FIT.max_explained_excess and pressure > GIVE_UP.excess
+    return explains_spool(residuals) and not is_near(residuals)
 
 
 def residual_outlier_share(residuals: Array) -> float:

@@ -288,7 +288,6 @@ class IdentificationSession:
         freed: NuisanceEstimate | None = None
         if best is None or not _severities_suffice(best.refined):
             hint = best.refined.values if best else severities_by_name(start)
-            alone_left = excess_cost(best.refined.residuals) if best else np.inf
             progress("nuisances", 0.0)
             basic = basic_nuisances_of(experiments[0].constants.OIL)
             freeing = NuisanceEstimator(
@@ -297,7 +296,7 @@ class IdentificationSession:
                 partial(progress, "nuisances"),
             )
             near_enough = near or is_calibrated_oil(experiments, self.prior.joint)
-            freed = freeing.estimated(experiments, hint if near_enough else None, alone_left)
+            freed = freeing.estimated(experiments, hint if near_enough else None)
         if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
             return self._concluded_by_severities(
                 first,

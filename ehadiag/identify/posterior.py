@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, GIVE_UP, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
 
 MIN_GRADIENT_SHARE = 1e-9
@@ -85,13 +85,11 @@ class SearchSchedule(msgspec.Struct, frozen=True):
     1), so that the search ends, and at the best place seen; 0: it does not go by the objective."""
     width: float = 2.0
     """Width of the density, in deviations of the linear problem."""
-    coarse: float = np.inf
-    """Objective over the number of samples beyond which `flat` grows in proportion to it, 1."""
 
 
 MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
     0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000,
-    flat=GIVE_UP.same_end_cost,
+    flat=10.0,
 )  # fmt: skip
 """Schedule for many unknowns, fast: with a half as least ratio 9 of 54 hard starts came to the
 optimum, in 360 runs each, and slow ones follow where it does not (ADR 8)."""
@@ -196,8 +194,8 @@ class _ObjectiveHistory:
     def is_flat(self) -> bool:
         """Whether the last rounds had the same objective several times."""
         late = sorted(self._objectives[-STALLED_ROUNDS:])[:STALLED_PLACES]
-        flat = self._schedule.flat * max(self._unit / self._schedule.coarse, 1.0)
-        return len(late) == STALLED_PLACES and late[-1] - late[0] < flat * max(self._unit, 1.0)
+        flat = self._schedule.flat * max(self._unit, 1.0)
+        return len(late) == STALLED_PLACES and late[-1] - late[0] < flat
 
 
 def cauchy_cost(residuals: Array) -> Array:
