@@ -10,6 +10,7 @@ the identification on the host and the one on board share.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -19,6 +20,18 @@ NOISE_OUTLIER_SHARE = 2.0 * NormalDist().cdf(-3.0)
 """Share of residuals of noise alone beyond three deviations, 1: 0.0027."""
 NORMAL_HALF_WIDTH_95 = NormalDist().inv_cdf(0.975)
 """Half of the central 95 % of a normal density, in deviations."""
+NUMERICAL_ZERO = 1e-9
+"""Share of a quantity that counts as none, 1: the rounding of a double, 2e-16, after equations that
+lose some six digits of it."""
+CAUCHY_SCALE = 3.0
+"""Scale of Cauchy's cost, in deviations: larger residuals count little. Noise alone has 0.3 % of
+them, `NOISE_OUTLIER_SHARE`."""
+
+
+def _mean_of_normal(function: Callable[[float], float]) -> float:
+    """Mean of a function of a standard normal variable, by the trapezoidal rule."""
+    places = [0.1 * k for k in range(-80, 81)]
+    return 0.1 * sum(NormalDist().pdf(place) * function(place) for place in places)
 
 
 class VerdictCriteria(msgspec.Struct, frozen=True):
@@ -129,9 +142,10 @@ class FitCriteria(msgspec.Struct, frozen=True):
     1.8 times as large as the noise have a tenth beyond three deviations."""
     wear_excess_factor: float = 2.0
     """By which wear may make more of what a model leaves, 1: friction acts on more of it."""
-    expected_cauchy_cost: float = 0.8618
-    """Mean of Cauchy's cost that an excess is over, 1. A standard normal residual has 0.874, 1.4 %
-    more; the limits of excess on this page were set with this value."""
+    expected_cauchy_cost: float = _mean_of_normal(
+        lambda residual: CAUCHY_SCALE**2 * math.log1p((residual / CAUCHY_SCALE) ** 2)
+    )
+    """Mean of Cauchy's cost of a standard normal residual, that an excess is over, 1: 0.874."""
     max_outliers_of_noise: float = 0.01
     """Largest share of residuals beyond three deviations where nothing is left to explain, and no
     further unknowns are needed, 1."""
@@ -143,8 +157,6 @@ class FitCriteria(msgspec.Struct, frozen=True):
     it out: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90, 1995)."""
     max_shown_std: float = 0.1
     """Largest standard deviation of a severity that the test shows, 1."""
-    bound_tolerance: float = 1e-6
-    """Distance of a severity from its bound at which it is on it, 1."""
     max_start_outliers: float = 0.15
     """Largest share of outliers of a start for the severities alone, 1: mostly 0.04 at most on a
     textbook's actuator, 0.29 and more on others; between break-aways a search may end away from the
@@ -189,29 +201,13 @@ class GiveUpCriteria(msgspec.Struct, frozen=True):
     """Outliers up to which what is left may be of break-aways at wrong ticks, 1."""
     starts: int = 3
     """Starts, 1: of 120 sound units in closed loop none needed more (ADR 24, constants)."""
-    max_open_loop_excess: float = 1.3
-    """Largest excess of open loop alone whose density closed loop starts from, 1: with more the
-    search has ended away from the optimum, with too narrow a density."""
-    min_other_end_gain: float = 30.0
-    """Least gain in objective of another place, 1."""
     max_trial_share: float = 0.5
     """Largest share of the excess over noise that an effect on trial, effects that have changed
     since a calibration, or another exponent leave, 1: loads of 20 to 80 N left 1.1 of 1.3 to 2.0,
     broken hardware as much as before."""
-    max_unchanged_excess: float = 1.3
-    """Largest excess by a calibration's prior of an unchanged unit, 1: wear shows what its model
-    leaves out, which loosened effects would replace."""
     min_unambiguous_hysteresis: float = 5e-3
     """Full relative width of hysteresis below which closed loop keeps the spool breaking away,
     1."""
-    max_last_part_step: float = 3.0
-    """Longest step by the last part of a test, in deviations of the first part: a longer one is
-    none of a small part, and the whole is refined (ADR 5)."""
-    max_severity_step: float = 1.0
-    """The same of a severity, in its deviations: beyond, one step does not lead to the optimum of
-    the whole test."""
-    max_cost_rise: float = 4.0
-    """Largest rise of the cost by that step, 1: what break-aways make of a descent."""
 
 
 GIVE_UP = GiveUpCriteria()
@@ -325,6 +321,13 @@ def _capped_variance(deviations: float) -> float:
     return 1.0 - 2.0 * deviations * normal.pdf(deviations) / inside
 
 
+def _kept_mean(share: float) -> float:
+    """Mean absolute value of a standard normal variable without its largest values."""
+    normal = NormalDist()
+    most = normal.inv_cdf(0.5 + 0.5 * share)
+    return 2.0 * (normal.pdf(0.0) - normal.pdf(most)) / share
+
+
 class EstimationRules(NamedTuple):
     """Noise, cost and uncertainty of residuals; those of a refinement are `RefinementRules`."""
 
@@ -332,13 +335,16 @@ class EstimationRules(NamedTuple):
     """Noise of a 12-bit channel with its rounding (PHY-21, PHY-22), LSB."""
     noise_kept_share: float = 0.98
     """Share of second differences from which noise is judged, 1: the largest ones are left out."""
-    noise_kept_mean: float = 0.75978
+    noise_kept_mean: float = _kept_mean(noise_kept_share)
     """Mean absolute value of a standard normal variable without its largest 2 %, 1."""
-    min_rest_samples: int = 20
-    """Least number of samples at rest from which an offset is taken, 1."""
-    cauchy_scale: float = 3.0
-    """Scale of Cauchy's cost, in deviations: larger residuals count little. Noise alone has 0.3 %
-    of them, `NOISE_OUTLIER_SHARE`."""
+    min_samples: int = 20
+    """Least number of samples, or of blocks, for a mean, 1: it is off by a fifth of their
+    deviation."""
+    min_ticks: int = 100
+    """Least number of ticks for a deviation, 1: it is off by 7 % (one over the root of twice the
+    number), and a null bias lets the spool settle for 71 (a unit of `test_few_effects`)."""
+    cauchy_scale: float = CAUCHY_SCALE
+    """The same, in deviations."""
     residual_cap: float = cauchy_scale**2
     """Largest square of one weighted residual that counts, in variances: of `cauchy_scale`."""
     max_row_scatter: float = 1.0
@@ -386,7 +392,7 @@ class RefinementRules(NamedTuple):
     """Share of samples with more scatter up to which the model is linear, 1."""
     damping: float = 0.1
     """Share of the density's information that holds a step back, 1."""
-    min_information: float = 1e-9
+    min_information: float = NUMERICAL_ZERO
     """Information on what nothing shows, in units of the scales."""
     max_mean_step: float = 0.25
     """Last step of a mean of rounds, in widths of the density, below which it has converged: where

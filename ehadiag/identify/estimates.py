@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_NOISE_EXCESS, FitQuality
 from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
-from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95, NUMERICAL_ZERO
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.identification_result import (
     Estimate,
@@ -304,8 +304,8 @@ def severity_estimates(
                 value=value,
                 std=std,
                 interval95=interval95(value, std),
-                at_bound=value <= item.lower + FIT.bound_tolerance
-                or value >= item.upper - FIT.bound_tolerance,
+                at_bound=value <= item.lower + NUMERICAL_ZERO
+                or value >= item.upper - NUMERICAL_ZERO,
                 shown=seen,
             )
         )

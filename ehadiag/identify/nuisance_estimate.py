@@ -24,6 +24,7 @@ from ehadiag.identify.estimates import (
     is_near,
     is_unexplainable,
     likelihood_ratio_cost,
+    misses_only_pressure,
     signal_excess_costs,
 )
 from ehadiag.identify.experiment import (
@@ -46,14 +47,11 @@ from ehadiag.identify.nuisance_search import (
     NuisanceSearchSettings,
     StagedSearchResult,
     free_run_model,
-    is_calibrated_oil,
     noise_scaled_model,
     search_in_stages,
 )
 from ehadiag.identify.partial_refinement import considered_parameters
 from ehadiag.identify.posterior import (
-    BRIEF_SCHEDULE,
-    FINAL_SCHEDULE,
     PosteriorResult,
     cauchy_cost,
     cauchy_costs,
@@ -153,25 +151,18 @@ def estimate_about(
     alone = settings.joint is None and all(
         item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
     )
-    given_up = not found.explained and not is_near(found.residuals)
-    if not (settings.give_up and given_up):
+    hopeless = is_unexplainable(found.residuals) or not is_near(found.residuals)
+    if found.explained or not (settings.give_up and hopeless):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
-        found_oil = found.explained and is_calibrated_oil(experiments, settings.joint)
         progress = settings.progress
         search = partial(
             search_posterior,
             prior=prior,
             information=information,
             linearise=partial(linearised_by_regression, rng=rng),
-            schedule=BRIEF_SCHEDULE if found_oil else FINAL_SCHEDULE,
             between=no_interruption if progress is None else partial(progress, 1.0),
         )
         if not alone:
-            if settings.goes_slow and not found_oil:
-                # A break-away may stand between the end of the search and the optimum.
-                density = _search_about(
-                    fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain
-                )
             density = _search_about(fine, search, density, RESTARTS.end_spread * density.root)
         else:
             late, begin = fine, replace(density, root=RESTARTS.end_spread * density.root)
@@ -259,19 +250,15 @@ def _with_judged_noise(experiments: Sequence[Experiment], residuals: Array) -> l
 
 
 def _search_about(
-    fine: Derivatives,
-    search: PosteriorSearch,
-    there: ParameterDensity,
-    root: Array,
-    least_gain: float = 0.0,
+    fine: Derivatives, search: PosteriorSearch, there: ParameterDensity, root: Array
 ) -> ParameterDensity:
-    """Search about a density; the end of it if that is better by a least gain, else the density.
+    """Search about a density; the end of it if that is better, else the density.
 
     root: of the covariance over which it searches.
     """
     seen = search(fine, begin=ParameterDensity(there.x, root)).density
     costs = cauchy_cost(fine.many(np.vstack([there.x, seen.x])))
-    return seen if costs[0] - costs[1] > least_gain else there
+    return seen if costs[0] > costs[1] else there
 
 
 def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
@@ -389,7 +376,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         hint: Mapping[str, float] | None, budget: int = NUISANCE_RUN_BUDGET,
     ) -> NuisanceEstimate:  # fmt: skip
         """Estimate where effects may have changed; the same where what is left is of no change."""
-        if found.explained or found.excess <= GIVE_UP.max_unchanged_excess:
+        if found.explained or found.excess <= FIT.max_explained_excess:
             return found
         return self._with(experiments, self.prior.loosened(), hint, budget=budget)
 
@@ -493,7 +480,8 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         self, experiments: Sequence[Experiment], found: NuisanceEstimate
     ) -> NuisanceEstimate:
         """Estimate a constant load, too, where that explains what the other effects do not."""
-        if not is_near(found.refined.residuals):
+        left = found.refined.residuals
+        if not (misses_only_pressure(left) and is_near(left)):
             return found
         values = found.refined.values
         load = (parameter("load"),)

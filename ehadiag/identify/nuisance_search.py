@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import GIVE_UP
+from ehadiag.core.criteria import FIT, GIVE_UP
 from ehadiag.identify.estimates import (
     ExplanationTest,
     excess_cost,
@@ -299,8 +299,6 @@ class StagedSearchResult(msgspec.Struct, frozen=True, eq=False):
     found: MultistartResult
     levels: NDArray[np.int64]
     """Of that model."""
-    restart_root: Array
-    """Root of the covariance over which a further look is taken; shape (c, c)."""
     evaluations: int
     """Runs of the model, with those of all stages."""
 
@@ -313,7 +311,7 @@ def search_in_stages(
     if not 0 < len(part) < len(experiments):
         return _search_recordings(experiments, settings)
     before = _search_recordings(part, settings)
-    led = excess_cost(before.found.residuals) <= GIVE_UP.max_open_loop_excess
+    led = excess_cost(before.found.residuals) <= FIT.max_explained_excess
     whole = _search_recordings(experiments, settings, before if led else None)
     return replace(whole, evaluations=before.evaluations + whole.evaluations)
 
@@ -386,7 +384,7 @@ def _search_recordings(
         looks_about=goes_slow and not (oil or priors or joint),
     )
     runs = sum(item.evaluations for item in (guide, model) if item)
-    return StagedSearchResult(model, found, coarse.levels, restart_root, runs)
+    return StagedSearchResult(model, found, coarse.levels, runs)
 
 
 def density_of_all_recordings(

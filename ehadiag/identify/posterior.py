@@ -14,11 +14,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, NUMERICAL_ZERO, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
-
-MIN_GRADIENT_SHARE = 1e-9
-"""Share of the largest gradient that counts as none."""
 
 
 def bounded_step(x: Array, normal: Array, gradient: Array, lower: Array, upper: Array) -> Array:
@@ -31,7 +28,7 @@ def bounded_step(x: Array, normal: Array, gradient: Array, lower: Array, upper: 
     out = x - np.linalg.solve(normal, gradient)
     if np.all((out >= lower) & (out <= upper)):
         return out
-    allowed = MIN_GRADIENT_SHARE * float(np.abs(gradient).max(initial=0.0))
+    allowed = NUMERICAL_ZERO * float(np.abs(gradient).max(initial=0.0))
     held = np.zeros(len(x), dtype=np.bool_)
     ends = x.copy()
     for _ in range(4 * len(x) + 4):
@@ -93,16 +90,10 @@ MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
 )  # fmt: skip
 """Schedule for many unknowns, fast: with a half as least ratio 9 of 54 hard starts came to the
 optimum, in 360 runs each, and slow ones follow where it does not (ADR 8)."""
-SLOW_SCHEDULE = replace(
-    MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, whole_rounds=70, width=3.0
-)
+SLOW_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, whole_rounds=70)
 """The same, where break-aways lead a faster search astray. Of 54 starts on nine recordings that are
 hard (closed loop, little hysteresis) 38 came to the optimum, with 700 runs each; with a ratio of
 0.75 19, with 480 runs; of 0.65 9, with 360; of 0.9 42, with 970."""
-FINAL_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, most_rounds=12, flat=4.0)
-"""Schedule of a last search, which begins near the optimum."""
-BRIEF_SCHEDULE = replace(FINAL_SCHEDULE, most_rounds=6)
-"""The same where a calibrated unit with oil is explained: its best place is found by then."""
 FEW_UNKNOWNS_SCHEDULE = SearchSchedule(
     0.2, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0
 )

@@ -25,10 +25,6 @@ from ehadiag.model.residual_models import SimdModel
 class RingScan(msgspec.Struct, frozen=True):
     """Range, step and criteria of the scan of the oil's stiffness."""
 
-    least: float = -0.6
-    """Least relative change of the stiffness, 1: beyond half of it, a total volume in the file."""
-    most: float = 1.3
-    """Largest relative change of the stiffness, 1: beyond twice, half the volume."""
     step: float = 2.5e-3
     """Step of the scan, 1: a quarter of the width of a valley, which is half a period in forty."""
     still_s: float = 0.1
@@ -117,7 +113,12 @@ def find_ring(experiments: Sequence[Experiment], values: Mapping[str, float]) ->
     still &= batch.weight[PRESSURE_ROW] > 0.0
     if not still.any():
         return None
-    stiffness = np.arange(SCAN.least, SCAN.most, SCAN.step)
+    # From half the stiffness, a total volume in the file, to twice.
+    least, most = (
+        0.5 * (1.0 - SCAN.max_factor_error) - 1.0,
+        2.0 * (1.0 + SCAN.max_factor_error) - 1.0,
+    )
+    stiffness = np.arange(least, most, SCAN.step)
     points = np.zeros((len(stiffness), len(free)))
     points[:, :-1] = [values[name] for name in names]
     points[:, -1] = stiffness

@@ -48,8 +48,6 @@ class Objective:
 
 EvaluationProgress = Callable[[int, int], None]
 """Called with evaluations done and budget."""
-MIN_GENERATIONS = 3
-"""Generations of the usual size below which a search makes smaller ones."""
 
 
 class SearchResult(msgspec.Struct, frozen=True, eq=False):
@@ -102,21 +100,16 @@ class CompactGa(msgspec.Struct, frozen=True):
     budget: int = 600
     """Evaluations at most."""
     virtual_population: float = 42.0
-    samples: int = RUN_BLOCK_SIZE
-    """Individuals drawn a generation: a block of runs."""
+    samples: int = RUN_BLOCK_SIZE // 2
+    """Individuals drawn a generation, 1: half a block of runs, since how often the elite moves on
+    counts more."""
     tolerance: float = 1e-6
     """Done when the deviation of every gene is below."""
     name: ClassVar[str] = "cga"
 
     def with_budget(self, budget: int) -> CompactGa:
-        """Return the same kind of solver with another number of evaluations.
-
-        Of few it makes generations of half the size: how often the elite moves on counts more.
-        """
-        samples = (
-            self.samples if budget >= MIN_GENERATIONS * self.samples else max(1, self.samples // 2)
-        )
-        return replace(self, budget=budget, samples=samples)
+        """Return the same solver with another number of evaluations."""
+        return replace(self, budget=budget)
 
     def minimise(
         self,

@@ -90,7 +90,7 @@ class OnboardSearchRules(NamedTuple):
     end."""
     min_noise: float = 0.5
     """Least noise, in units of the plan's: a converter's rounding alone makes more."""
-    min_rest_samples: float = float(ESTIMATION.min_rest_samples)
+    min_rest_samples: float = float(ESTIMATION.min_samples)
     """Least number of samples at rest from which an offset is taken, 1."""
     most_held: float = 20.0
     """Distance of the spool at rest from its mean in closed loop, in units of the plan's noise,
