@@ -388,7 +388,7 @@ def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) ->
 
 
 EXPONENTS = 41
-"""Number of exponents of a range, its ends among them."""
+"""Number of exponents of a range, its ends among them, 1: steps of 0.05."""
 FIRST_STAGE_STD = 0.02
 """Deviation of the clogging over the friction with the least exponent, 1, by the first stage's law
 that goes with an exponent: 0.018 to 0.032 on units of exponent 0 that were identified with 2."""

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT, Actuator
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import FIT, LOSSES, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import FIT, GIVE_UP, LOSSES, NORMAL_HALF_WIDTH_95
 from ehadiag.identify import compact_ga
 from ehadiag.identify.estimates import (
     estimate_covariance,
@@ -28,9 +28,9 @@ from ehadiag.identify.estimates import (
     friction_by_exponent,
     identification_result,
     independent_covariance,
+    is_noise,
     likelihood_ratio_cost,
     over_exponents,
-    refinement_outlier_share,
 )
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, share_offsets
 from ehadiag.identify.identification_result import Identification, IdentificationTiming
@@ -404,7 +404,7 @@ class IdentificationSession:
     def _resembles(self, experiments: Sequence[Experiment], point: Array) -> bool:
         """Whether a refinement from a point may explain the recordings."""
         look = self._start_residuals(experiments, point)
-        return look.outlier_share <= FIT.max_start_outliers
+        return look.outlier_share <= GIVE_UP.near_outliers
 
     def _first(self, experiments: Sequence[Experiment]) -> tuple[FirstApproximation, Array]:
         """First approximation, and the same as a point among the severities."""
@@ -501,10 +501,7 @@ def _interim_estimate(refined: Refinement) -> InterimEstimate:
 def _severities_suffice(refinement: Refinement) -> bool:
     """Whether the severities alone explain a recording, without slow residuals, of which
     small nuisances would be the cause."""
-    return (
-        refinement_outlier_share(refinement) <= FIT.max_outliers_of_noise
-        and excess_cost(refinement.residuals) <= FIT.max_excess_without_nuisances
-    )
+    return is_noise(refinement.residuals)
 
 
 def _nuisances_explain_no_more(freed: NuisanceEstimate, alone: SeverityAttempt) -> bool:

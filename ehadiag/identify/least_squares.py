@@ -259,7 +259,7 @@ class NearRules(NamedTuple):
     """Width of a look at an earlier estimate, 1: a wear of up to 0.002 since then is within
     four."""
     max_rounds: int = 3
-    """Rounds, 1: a fourth would take as long as what a search saves."""
+    """Rounds, 1: a fourth would take as long as what a search saves (`tools/study cube --wear`)."""
     max_jumped_rows: int = 2
     """Rows that jump where no break-away does, 1: one a tick later moves three samples and more."""
     min_jump_scatter: float = 0.3

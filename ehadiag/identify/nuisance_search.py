@@ -42,6 +42,7 @@ from ehadiag.identify.posterior import (
 )
 from ehadiag.identify.prior import (
     SPOOL_OFFSET_ALIAS,
+    WIDTHS,
     JointPrior,
     ParameterPrior,
     density_about,
@@ -57,10 +58,6 @@ from ehadiag.model.residual_models import SimdModel
 class RestartRules(msgspec.Struct, frozen=True):
     """Restarts of a search."""
 
-    spread_share: float = 0.1
-    """Spread about the best end so far, in spreads of the first: so wide a search found an optimum
-    beyond one break-away (one unit had been 17 deviations off), and one about the end left 1 of 40
-    units beside the optimum, not 13 (ADR 23)."""
     end_spread: float = 3.0
     """Spread of a look about an end that misses only the pressure, and of the last one with the
     noise as judged, in spreads of that end: with looks of the first kind 1 of 40 units ended beside
@@ -70,8 +67,6 @@ class RestartRules(msgspec.Struct, frozen=True):
     alias_points: int = 128
     """Points on it where little is left, 1: null biases 4 µA apart are spools 0.15 µm apart, or
     0.3 MPa on a jack that sticks; with 16 what explains the pressure was passed over."""
-    closed_loop_share: float = 0.3
-    """Spread about the best end in closed loop, in spreads of what open loop alone leaves."""
     relaxed_noise: float = 100.0
     """Weight of the spool over the pressure while the spool is explained first, 1; of a calibrated
     unit the pressure has none."""
@@ -79,15 +74,13 @@ class RestartRules(msgspec.Struct, frozen=True):
     """Scans of the jack's friction, 1: the spacing of the last is 0.05 % of the severity."""
     scan_spread: float = 2.0
     """Spread about the best place of the last scan, in its spacings."""
-    known_spread: float = 0.3
-    """Spread of all else then, in spreads of the end of the spool's search: with 1 a start took up
-    to fifteen rounds, with 0.1 one of 24 recordings was not explained."""
 
 
 RESTARTS = RestartRules()
 
 NUISANCE_RUN_BUDGET = 1600
-"""Runs of the model after which no further start is made, 1: a start takes some 200 to 700."""
+"""Runs of the model after which no further start is made, 1: some 300 ms, which a refusal may take
+(`tools/study hardware`); a start takes 200 to 700."""
 
 
 class StartEnd(msgspec.Struct, frozen=True, eq=False):
@@ -150,7 +143,7 @@ def multistart_search(
     long as that gains. Returns best end, and those of all starts.
     """
     until = model.evaluations + budget
-    restart_root = RESTARTS.spread_share * prior.root if restart_root is None else restart_root
+    restart_root = WIDTHS.near * prior.root if restart_root is None else restart_root
 
     def between() -> None:
         if progress is not None:
@@ -338,10 +331,10 @@ def _search_recordings(
     if hint is not None:
         origins = [density_about(model, first, hint, known=known), *origins[::-1]]
     guide: Derivatives | None = None
-    restart_root = RESTARTS.spread_share * first.root
+    restart_root = WIDTHS.near * first.root
     if before is not None:
         there = density_of_all_recordings(before.model, before.found.density, model)
-        origins, restart_root = [there], RESTARTS.closed_loop_share * there.root
+        origins, restart_root = [there], WIDTHS.near * there.root
         if hint is not None and not settings.hint_of_open:
             origins = [ParameterDensity(density_about(model, first, hint).x, restart_root), there]
     elif oil:
@@ -466,7 +459,7 @@ def _jack_density(
         x = points[int(np.argmin(cauchy_cost(runs)))]
         places = x[j] + span * about
     row = model.curved.tolist().index(j)
-    root = RESTARTS.known_spread * guided.root
+    root = WIDTHS.loosened * guided.root
     root[row] *= RESTARTS.scan_spread * span / np.linalg.norm(root[row])
     return ParameterDensity(x, root)
 

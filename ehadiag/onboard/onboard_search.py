@@ -96,7 +96,7 @@ class OnboardSearchRules(NamedTuple):
     """Distance of the spool at rest from its mean in closed loop, in units of the plan's noise,
     from which on it is held beside its middle: of seven units the mean was within 9 of the offset,
     and a spool that was held up to 230 off."""
-    run_in_s: float = SEARCH_STAGES.first_run_in_s
+    run_in_s: float = SEARCH_STAGES.run_in_s
     """Run-in before a window, s."""
     std: float = 0.4
     """Standard deviation of a severity at the start of the genetic search, 1: that of the last
