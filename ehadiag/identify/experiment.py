@@ -44,9 +44,11 @@ class RestRules(msgspec.Struct, frozen=True):
     1: 0.3 MPa of the default range."""
     settling_lsb: float = 5.0
     """Distance of the first samples from the second half of the rest that is no rest, LSB: a null
-    bias beyond the spool's friction moves it from the first tick on."""
+    bias beyond the spool's friction moves it from the first tick on. Nine deviations of half a step
+    of noise and rounding (`ESTIMATION.noise_lsb`)."""
     settling_noise: float = 8.0
-    """The same distance, in deviations of the noise."""
+    """The same distance, in deviations of the noise where that is more: noise alone does not make
+    it."""
     unsettled_ratio: float = 1.5
     """Ticks for which the pressure of oil that has not settled is left out, over those at rest, 1:
     it fills the chambers of a jack that sticks within 50 ms of a rest of 0.2 s, and the spool
@@ -59,7 +61,7 @@ class RestRules(msgspec.Struct, frozen=True):
     of a closed loop has left it: at its limit of friction it takes that long on a ramp. With 0,
     0.025 and 0.05 one or two of six frictions that were 6 to 31 deviations off stay so."""
     motionless_ticks: int = 10
-    """Ticks in which the jack has not yet left its middle, 1."""
+    """Ticks in which the jack has not yet left its middle, 1: a bound of judgement."""
     slow_noise_lsb: float = 4.0
     """Range of a jack's position by the noise of half a step of the converter, LSB: four
     deviations to either side."""

@@ -78,9 +78,9 @@ class RestartRules(msgspec.Struct, frozen=True):
 
 RESTARTS = RestartRules()
 
-NUISANCE_RUN_BUDGET = 1600
-"""Runs of the model after which no further start is made, 1: some 300 ms, which a refusal may take
-(`tools/study hardware`); a start takes 200 to 700."""
+NUISANCE_RUN_BUDGET = 3200
+"""Runs of the model after which no further start is made, 1: of four starts in closed loop, which
+take some 200 to 700 each, and the looks about their ends."""
 
 
 class StartEnd(msgspec.Struct, frozen=True, eq=False):

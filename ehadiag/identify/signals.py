@@ -22,7 +22,9 @@ from firmware_iface.recording import CHANNELS, Acquisition, Channel, Channels, C
 from firmware_iface.stored_test import Controller, StoredTest
 
 QUIET_BLOCK_RATIO = 0.867
-"""Deviation of white noise in the quietest fifth of such blocks (0.864 to 0.869 for 2 to 5.5 s)."""
+"""Deviation of white noise in the quietest fifth of blocks of `ESTIMATION.min_ticks`, 1 (0.864 to
+0.869 for 2 to 5.5 s; a tenth of a chi-square of the 51 degrees of freedom of second differences has
+0.870)."""
 
 
 def rounding_noise(channel: Channel) -> float:
@@ -77,13 +79,15 @@ class CommandRules(msgspec.Struct, frozen=True):
     """Reconstruction of commands and currents."""
 
     min_misfit_gain: float = 30.0
-    """Least gain in the sum of squares of a rounding over none, in variances."""
+    """Least gain in the sum of squares of a rounding over none, in variances: a
+    likelihood ratio of e^15, whichever of 21 resolutions is tried."""
     max_guessed_ticks: int = 50
     """Largest number of ticks of a hole that count as guessed, 1: in a longer one there is no
     sample either that a wrong current could affect. An integral in the control law keeps all of
     them."""
     rescaled_tolerance_lsb: float = 0.1
-    """Rounding of values that a bus of another scale rounded once more, LSB."""
+    """Rounding of values that a bus of another scale rounded once more, LSB: a fifth of half a
+    step, so that the nearest step is the converter's."""
 
 
 COMMANDS = CommandRules()
@@ -323,7 +327,8 @@ class CodeLimits(msgspec.Struct, frozen=True):
     """Limits by which a current tells the code of the position that it follows."""
 
     linear: float = 0.95
-    """Largest demand at which the current follows the position, of the rated current, 1."""
+    """Largest demand at which the current follows the position, of the rated current, 1: a
+    twentieth below it the noise of a current does not reach it."""
     limited: float = 1.2
     """Least demand at which the current stands at its limit, of the rated current, 1: noise of the
     position does not bring it back."""
