@@ -179,10 +179,10 @@ def calibrated_explanation_test(fit: FitQuality) -> ExplanationTest:
 def is_unexplainable(residuals: Array) -> bool:
     """Whether a search has left what no further start will explain.
 
-    Half of all samples are beyond three deviations, or the spool is explained and the pressure is
-    not: where a search ends between break-aways it is the spool that jumps.
+    Half of all samples are beyond three deviations, or the pressure alone is far off: where a
+    search ends between break-aways it is the spool that jumps.
     """
-    return residual_outlier_share(residuals) > GIVE_UP.outliers or misses_only_pressure(residuals)
+    return residual_outlier_share(residuals) > GIVE_UP.outliers or is_pressure_misfit(residuals)
 
 
 def misses_only_pressure(residuals: Array) -> bool:

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT, Actuator
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import FIT, GIVE_UP, LOSSES, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import FIT, LOSSES, NORMAL_HALF_WIDTH_95
 from ehadiag.identify import compact_ga
 from ehadiag.identify.estimates import (
     estimate_covariance,
@@ -404,7 +404,7 @@ class IdentificationSession:
     def _resembles(self, experiments: Sequence[Experiment], point: Array) -> bool:
         """Whether a refinement from a point may explain the recordings."""
         look = self._start_residuals(experiments, point)
-        return look.outlier_share <= GIVE_UP.near_outliers
+        return look.outlier_share <= FIT.max_start_outliers
 
     def _first(self, experiments: Sequence[Experiment]) -> tuple[FirstApproximation, Array]:
         """First approximation, and the same as a point among the severities."""

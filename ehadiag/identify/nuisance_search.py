@@ -24,6 +24,7 @@ from ehadiag.identify.estimates import (
     is_near,
     is_noise,
     is_unexplainable,
+    misses_only_pressure,
 )
 from ehadiag.identify.experiment import Experiment, lay_out_spans, unknowns_of
 from ehadiag.identify.linearisation import (
@@ -63,8 +64,8 @@ class RestartRules(msgspec.Struct, frozen=True):
     noise as judged, in spreads of that end: with looks of the first kind 1 of 40 units ended beside
     the optimum, 13 without (ADR 23); other spreads were not recorded."""
     alias_half_span: float = 1.25
-    """Half-width over which a parameter is moved against its alias, in units of its scale: a quarter
-    of what the null bias may span, to either side."""
+    """Half-width over which a parameter is moved against its alias, in units of its scale: a
+    quarter of what the null bias may span, to either side."""
     alias_points: int = 128
     """Points on it where little is left, 1: null biases 4 µA apart are spools 0.15 µm apart, or
     0.3 MPa on a jack that sticks; with 16 what explains the pressure was passed over."""
@@ -140,10 +141,10 @@ def multistart_search(
     model after which no further start is made; seed: the same seed gives the same answer; progress:
     called before each round and after each start with the share of the budget that is spent; what
     it raises ends the search; gives_up: whether further starts will not help, by the best
-    residuals, of which there are `GIVE_UP.starts` at most, too; goes_slow: whether all starts but
-    the first are slow and from the last origin; else every other start is near the best end so far;
-    looks_about: whether the first start, and each that leaves little, looks again about its end as
-    long as that gains. Returns best end, and those of all starts.
+    residuals; if given, two starts that only miss the pressure end the search, too, and
+    `GIVE_UP.starts`; goes_slow: whether all starts but the first are slow and from the last origin;
+    else every other start is near the best end so far; looks_about: whether the first start, and
+    each that leaves little, looks again about its end as long as that gains. Returns best end, and those of all starts.
     """
     until = model.evaluations + budget
     restart_root = WIDTHS.near * prior.root if restart_root is None else restart_root
@@ -179,9 +180,14 @@ def multistart_search(
             gains = explains_far_more(*left)
             end = min(end, other, key=lambda item: item.cost)
         places.append(StartEnd(end.density.x, end.cost))
+        again = best is not None and all(
+            misses_only_pressure(item.residuals) for item in (best, end)
+        )
         if best is None or end.cost < best.cost:
             best = end
-        if gives_up is not None and (len(places) >= GIVE_UP.starts or gives_up(best.residuals)):
+        if gives_up is not None and (
+            again or len(places) >= GIVE_UP.starts or gives_up(best.residuals)
+        ):
             break
         between()
     return replace(best, places=tuple(places))

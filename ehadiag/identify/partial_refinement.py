@@ -94,7 +94,7 @@ class StartResiduals(msgspec.Struct, frozen=True, eq=False):
     def outlier_share(self) -> float:
         """Share of residuals beyond the cap, offsets aside.
 
-        Above `GIVE_UP.near_outliers` a refinement from there will not explain them.
+        Above `FIT.max_start_outliers` a refinement from there will not explain them.
         """
         residuals = self.residuals.copy()
         for item in SENSOR_OFFSETS:

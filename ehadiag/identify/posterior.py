@@ -89,7 +89,7 @@ MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
 )  # fmt: skip
 """Schedule for many unknowns, fast: with a half as least ratio 9 of 54 hard starts came to the
 optimum, in 360 runs each, and slow ones follow where it does not (ADR 8)."""
-SLOW_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70)
+SLOW_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, width=3.0)
 """The same, where break-aways lead a faster search astray. Of 54 starts on nine recordings that are
 hard (closed loop, little hysteresis) 38 came to the optimum, with 700 runs each; with a ratio of
 0.75 19, with 480 runs; of 0.65 9, with 360; of 0.9 42, with 970."""
