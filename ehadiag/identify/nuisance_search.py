@@ -144,7 +144,8 @@ def multistart_search(
     residuals; if given, two starts that only miss the pressure end the search, too, and
     `GIVE_UP.starts`; goes_slow: whether all starts but the first are slow and from the last origin;
     else every other start is near the best end so far; looks_about: whether the first start, and
-    each that leaves little, looks again about its end as long as that gains. Returns best end, and those of all starts.
+    each that leaves little, looks again about its end as long as that gains. Returns best
+    end, and those of all starts.
     """
     until = model.evaluations + budget
     restart_root = WIDTHS.near * prior.root if restart_root is None else restart_root
