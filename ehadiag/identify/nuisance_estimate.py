@@ -151,7 +151,7 @@ def estimate_about(
     alone = settings.joint is None and all(
         item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
     )
-    hopeless = is_unexplainable(found.residuals) or not is_near(found.residuals)
+    hopeless = misses_only_pressure(found.residuals) or not is_near(found.residuals)
     if found.explained or not (settings.give_up and hopeless):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
         progress = settings.progress
@@ -336,7 +336,9 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
         found = self._with(experiments, self.prior, hint, budget=budget)
-        if any(creeps) and not (found.explained or is_unexplainable(found.refined.residuals)):
+        left = found.refined.residuals
+        hopeless = is_unexplainable(left) or misses_only_pressure(left)
+        if any(creeps) and not (found.explained or hopeless):
             followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
