@@ -312,6 +312,11 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
+def _is_hopeless(residuals: Array) -> bool:
+    """Whether another kind of search will not explain what one leaves either."""
+    return is_unexplainable(residuals) or misses_only_pressure(residuals)
+
+
 class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
@@ -336,9 +341,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
         found = self._with(experiments, self.prior, hint, budget=budget)
-        left = found.refined.residuals
-        hopeless = is_unexplainable(left) or misses_only_pressure(left)
-        if any(creeps) and not (found.explained or hopeless):
+        if any(creeps) and not (found.explained or _is_hopeless(found.refined.residuals)):
             followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
