@@ -33,7 +33,7 @@ from ehadiag.compile.worker import (
     Processor,
     TableArgument,
 )
-from ehadiag.core.actuator import Actuator
+from ehadiag.core.actuator import MAX_NOISE_EXCESS, Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, __version__
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.criteria import FIT, LOSSES, READINGS, RECORDING, VERDICT
@@ -198,7 +198,7 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         # Where nothing is in doubt but the noise, what is left is an effect; the package frees it.
         most_outliers=FIT.max_outliers_of_noise if exact else outliers,
         most_rms=rms,
-        most_excess=FIT.max_excess_without_nuisances if exact and calibration is None else math.inf,
+        most_excess=MAX_NOISE_EXCESS if exact and calibration is None else math.inf,
         search_outliers=max(FIT.max_outliers_of_noise, outliers - FIT.max_outlier_share),
         most_anchored=float(FIT.max_anchor_count),
         most_std=FIT.max_shown_std,

@@ -28,9 +28,12 @@ from ehadiag.compile.jit import Array, Array2, bare_kernel, kernel
 
 ELITE_PULL = 0.5
 """Share of its distance from the elite by which the mean moves after a generation, 1: the vector
-would else collapse away from the optimum while the elite moves on."""
+would else collapse away from the optimum while the elite moves on. Half: as much of the old as of
+the new."""
 MIN_SPREAD_STEPS = 1.5
-"""Least deviation after a generation, in steps of the elite, for the same reason."""
+"""Least deviation after a generation, in steps of the elite, for the same reason: more than one, so
+that the next step can be as long; a bound of judgement, as the paper's tables have it (`tools/study
+paper`)."""
 
 
 class CompactGaState(NamedTuple):

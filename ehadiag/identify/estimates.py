@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_NOISE_EXCESS, FitQuality
 from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
-from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95, NUMERICAL_ZERO
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.identification_result import (
     Estimate,
@@ -175,28 +175,18 @@ def calibrated_explanation_test(fit: FitQuality) -> ExplanationTest:
     )
 
 
-def is_unexplainable(
-    residuals: Array, starts: int, *, astray: bool = False, soon: bool = False
-) -> bool:
-    """Whether so much is left after so many starts that further ones will not explain it.
+def is_unexplainable(residuals: Array) -> bool:
+    """Whether a search has left what no further start will explain.
 
-    astray: whether a search may well end away from the optimum; soon: whether the spool shows that.
+    Half of all samples are beyond three deviations, or the pressure alone is far off: where a
+    search ends between break-aways it is the spool that jumps.
     """
-    most = GIVE_UP.outliers_closed_loop if astray else GIVE_UP.outliers
-    outliers = residual_outlier_share(residuals)
-    if outliers > most[min(starts, len(most)) - 1]:
-        return True
-    if starts < 2 and not (astray and soon):
-        return False
-    spool, *others = signal_excess_costs(residuals)
-    pressure = max(others, default=0.0)
-    if not astray:
-        return max(spool, pressure) > GIVE_UP.excess
-    if pressure > max(spool, GIVE_UP.excess) and (starts > 1 or spool <= GIVE_UP.excess):
-        return outliers > GIVE_UP.pressure_outliers[min(starts, 2) - 1]
-    return starts > 1 and spool > (
-        GIVE_UP.excess if 0.0 < pressure <= FIT.max_explained_excess else GIVE_UP.spool_excess
-    )
+    return residual_outlier_share(residuals) > GIVE_UP.outliers or is_pressure_misfit(residuals)
+
+
+def misses_only_pressure(residuals: Array) -> bool:
+    """Whether the spool is explained, and the pressure is not."""
+    return explains_spool(residuals) and excess_cost(residuals) > FIT.max_explained_excess
 
 
 def explains_spool(residuals: Array) -> bool:
@@ -206,18 +196,12 @@ def explains_spool(residuals: Array) -> bool:
 
 def is_near(residuals: Array) -> bool:
     """Whether so little is left that it may be of break-aways at wrong ticks."""
-    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
-
-
-def misses_only_pressure(residuals: Array) -> bool:
-    """Whether the spool is explained, and the pressure is not."""
-    return explains_spool(residuals) and excess_cost(residuals) > FIT.max_explained_excess
+    return residual_outlier_share(residuals) <= GIVE_UP.near_outliers
 
 
 def is_pressure_misfit(residuals: Array) -> bool:
     """Whether the spool, where break-aways happen, is explained and the pressure is far from it."""
-    spool, pressure = signal_excess_costs(residuals)[:2]
-    return spool <= FIT.max_explained_excess and pressure > GIVE_UP.excess
+    return explains_spool(residuals) and not is_near(residuals)
 
 
 def residual_outlier_share(residuals: Array) -> float:
@@ -319,8 +303,8 @@ def severity_estimates(
                 value=value,
                 std=std,
                 interval95=interval95(value, std),
-                at_bound=value <= item.lower + FIT.bound_tolerance
-                or value >= item.upper - FIT.bound_tolerance,
+                at_bound=value <= item.lower + NUMERICAL_ZERO
+                or value >= item.upper - NUMERICAL_ZERO,
                 shown=seen,
             )
         )
@@ -403,7 +387,7 @@ def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) ->
 
 
 EXPONENTS = 41
-"""Number of exponents of a range, its ends among them."""
+"""Number of exponents of a range, its ends among them, 1: steps of 0.05."""
 FIRST_STAGE_STD = 0.02
 """Deviation of the clogging over the friction with the least exponent, 1, by the first stage's law
 that goes with an exponent: 0.018 to 0.032 on units of exponent 0 that were identified with 2."""

@@ -14,7 +14,6 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels, conversion_of
 from ehadiag.core.criteria import ANCHORING, ESTIMATION
 from ehadiag.identify.signals import (
-    QUIET_BLOCK_TICKS,
     CurrentTrace,
     acquired_current,
     commanded_current,
@@ -45,15 +44,15 @@ class RestRules(msgspec.Struct, frozen=True):
     1: 0.3 MPa of the default range."""
     settling_lsb: float = 5.0
     """Distance of the first samples from the second half of the rest that is no rest, LSB: a null
-    bias beyond the spool's friction moves it from the first tick on."""
+    bias beyond the spool's friction moves it from the first tick on. Nine deviations of half a step
+    of noise and rounding (`ESTIMATION.noise_lsb`)."""
     settling_noise: float = 8.0
-    """The same distance, in deviations of the noise."""
+    """The same distance, in deviations of the noise where that is more: noise alone does not make
+    it."""
     unsettled_ratio: float = 1.5
     """Ticks for which the pressure of oil that has not settled is left out, over those at rest, 1:
     it fills the chambers of a jack that sticks within 50 ms of a rest of 0.2 s, and the spool
     sticks on."""
-    min_blocks: int = 20
-    """Least number of blocks from which noise is judged, 1."""
     breakaway_s: float = 0.25
     """Longest time, s, from the command's first change to the pressure's: a spool at its limit of
     friction takes 0.1 s on a ramp of the closed test."""
@@ -62,14 +61,10 @@ class RestRules(msgspec.Struct, frozen=True):
     of a closed loop has left it: at its limit of friction it takes that long on a ramp. With 0,
     0.025 and 0.05 one or two of six frictions that were 6 to 31 deviations off stay so."""
     motionless_ticks: int = 10
-    """Ticks in which the jack has not yet left its middle, 1."""
+    """Ticks in which the jack has not yet left its middle, 1: a bound of judgement."""
     slow_noise_lsb: float = 4.0
     """Range of a jack's position by the noise of half a step of the converter, LSB: four
     deviations to either side."""
-    min_held_ticks: int = 100
-    """Least number of ticks of a hold, 1: a null bias lets the spool settle for 71 (a unit of
-    `test_few_effects` with data 5 % off); a pressure that rings on its oil at 80 Hz turns within
-    a quarter of that."""
 
 
 REST = RestRules()
@@ -217,7 +212,7 @@ def build_experiment(
         spool[:rest] = pressure[:rest] = np.nan
         rest, spool_offset, pressure_offset = 0, 0.0, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
-    rested = rest >= ESTIMATION.min_rest_samples
+    rested = rest >= ESTIMATION.min_samples
     # A motion to and fro leaves the sensor's offset.
     centred = pressure - _mean_of_motion(pressure, test)
     slips, held = (0, 0) if rested else _held_ticks(centred, test, channels.pressure)
@@ -326,7 +321,7 @@ def _ticks_before_search(test: StoredTest) -> int:
 
 def noise_is_judged_early(test: StoredTest) -> bool:
     """Whether the test's first part is long enough to judge the noise by."""
-    return _ticks_before_search(test) >= REST.min_blocks * QUIET_BLOCK_TICKS
+    return _ticks_before_search(test) >= ESTIMATION.min_samples * ESTIMATION.min_ticks
 
 
 def _ticks_at_rest(current: Array) -> int:
@@ -363,7 +358,7 @@ def _held_ticks(pressure: Array, test: StoredTest, channel: Channel) -> tuple[in
             return 0, 0  # it rests
         moved = np.flatnonzero(np.abs(pressure[begin:] - place) > most)
         end = begin + int(moved[0]) if moved.size else len(pressure)
-        if end - begin < REST.min_held_ticks:
+        if end - begin < ESTIMATION.min_ticks:
             continue  # it comes by, nothing holds it
         stands = end > quiet + round(REST.breakaway_s * test.rate)  # a sensor, not an actuator
         return (0, 0) if stands else (begin, end)
@@ -445,7 +440,7 @@ def _settles(values: Array, channel: Channel) -> bool:
 def _mean(values: Array) -> float:
     """Mean of what is there; 0 of too little."""
     seen = values[np.isfinite(values)]
-    return float(seen.mean()) if seen.size >= ESTIMATION.min_rest_samples else 0.0
+    return float(seen.mean()) if seen.size >= ESTIMATION.min_samples else 0.0
 
 
 def _mean_at_start(values: Array) -> float:

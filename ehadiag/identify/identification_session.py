@@ -28,9 +28,9 @@ from ehadiag.identify.estimates import (
     friction_by_exponent,
     identification_result,
     independent_covariance,
+    is_noise,
     likelihood_ratio_cost,
     over_exponents,
-    refinement_outlier_share,
 )
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, share_offsets
 from ehadiag.identify.identification_result import Identification, IdentificationTiming
@@ -290,7 +290,6 @@ class IdentificationSession:
         freed: NuisanceEstimate | None = None
         if best is None or not _severities_suffice(best.refined):
             hint = best.refined.values if best else severities_by_name(start)
-            alone_left = excess_cost(best.refined.residuals) if best else np.inf
             progress("nuisances", 0.0)
             basic = basic_nuisances_of(experiments[0].constants.OIL)
             freeing = NuisanceEstimator(
@@ -299,7 +298,7 @@ class IdentificationSession:
                 partial(progress, "nuisances"),
             )
             near_enough = near or is_calibrated_oil(experiments, self.prior.joint)
-            freed = freeing.estimated(experiments, hint if near_enough else None, alone_left)
+            freed = freeing.estimated(experiments, hint if near_enough else None)
         if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
             return self._concluded_by_severities(
                 first,
@@ -505,10 +504,7 @@ def _interim_estimate(refined: Refinement) -> InterimEstimate:
 def _severities_suffice(refinement: Refinement) -> bool:
     """Whether the severities alone explain a recording, without slow residuals, of which
     small nuisances would be the cause."""
-    return (
-        refinement_outlier_share(refinement) <= FIT.max_outliers_of_noise
-        and excess_cost(refinement.residuals) <= FIT.max_excess_without_nuisances
-    )
+    return is_noise(refinement.residuals)
 
 
 def _nuisances_explain_no_more(freed: NuisanceEstimate, alone: SeverityAttempt) -> bool:

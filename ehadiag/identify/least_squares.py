@@ -208,28 +208,22 @@ LAST_ROUND_WEIGHINGS = 3
 """Weighings of a last round, 1: oil half a step colder than the bus says shifts many residuals."""
 
 
-def last_round(
-    model: Derivatives, density: ParameterDensity, settled: bool, *others: Array
-) -> tuple[Refinement, list[float]]:
+def last_round(model: Derivatives, density: ParameterDensity, *, settled: bool) -> Refinement:
     """Linearise the model over a density once more, and step with oil and supply free.
 
     model: of all of the tests, re-anchored on the spool; settled: whether the rounds before
-    converged; others: further points, run in the same blocks. Returns the refinement, whose
-    residuals are those of `model` moved by the lines, and the costs of the density's mean and of
-    the other points. It has converged only where its own step, but for what oil and supply add, is
-    at most a deviation.
+    converged. The residuals are those of `model` moved by the lines. It has converged only where
+    its own step, but for what oil and supply add, is at most a deviation.
     """
     cross = CoordinateCross.about(model, density)
-    count = len(cross.points)
-    runs, considered, anchored = model.at(*cross.points, *others)
-    linear = cross.lines(model, runs[:count])
+    runs, considered, anchored = model.at(*cross.points)
+    linear = cross.lines(model, runs)
     found = refined_by_step(model, linear, considered, anchored, settled=settled)
     found = _without_jumps(found, linear)
     step = _last_round_step(model, linear, considered[:0])[0] - linear.at
     most = near_spread(found) / FEW_UNKNOWNS_SCHEDULE.width
     rests = bool(np.all(np.abs(step * found.scale)[model.curved] <= most))
-    found = replace(found, step=step, converged=settled and rests)
-    return found, [capped_cost(linear.middle), *map(capped_cost, runs[count:])]
+    return replace(found, step=step, converged=settled and rests)
 
 
 def refined_by_step(
@@ -263,7 +257,7 @@ class NearRules(NamedTuple):
     """Width of a look at an earlier estimate, 1: a wear of up to 0.002 since then is within
     four."""
     max_rounds: int = 3
-    """Rounds, 1: a fourth would take as long as what a search saves."""
+    """Rounds, 1: a fourth would take as long as what a search saves (`tools/study cube --wear`)."""
     max_jumped_rows: int = 2
     """Rows that jump where no break-away does, 1: one a tick later moves three samples and more."""
     min_jump_scatter: float = 0.3
@@ -271,8 +265,6 @@ class NearRules(NamedTuple):
     104 refinements ended up to 1.6 deviations from a search's estimate."""
     max_step: float = 0.5
     """Step of a round at rest, in deviations; with 1 one of 98 refinements ended 1.6 away."""
-    min_information: float = 1e-12
-    """Information on what no sample shows, in units of the scales."""
 
 
 NEAR = NearRules()
@@ -314,7 +306,9 @@ def near_spread(found: Refinement) -> Array:
 
 def deviations(normal: Array) -> Array:
     """Standard deviations of the estimates by their information."""
-    return np.sqrt(np.diag(np.linalg.inv(normal + NEAR.min_information * np.eye(len(normal)))))
+    return np.sqrt(
+        np.diag(np.linalg.inv(normal + REFINEMENT.min_information * np.eye(len(normal))))
+    )
 
 
 def refined_with_day(model: Derivatives, found: Refinement, linear: LinearModel) -> Refinement:

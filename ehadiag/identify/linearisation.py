@@ -28,14 +28,17 @@ class DifferenceRules(NamedTuple):
     """Differences of residuals at a point."""
 
     step: float = 5e-5
-    """Half-width of the differences, in units of the parameters' scales."""
+    """Half-width of the differences, in units of the parameters' scales: half the deviation that
+    noise leaves of a severity, 1e-4 (docs/explanation/identification-results.md)."""
     wide_step: float = 2e-4
-    """Half-width of the differences that check them, in units of the parameters' scales."""
+    """Half-width of the differences that check them, in units of the parameters' scales: four times
+    as wide, two deviations."""
     max_difference: float = 0.2
     """Largest relative difference of derivatives over the two widths, 1, with the typical
-    derivative."""
+    derivative: it decides which rows a bound counts, and no estimate."""
     max_kink: float = 0.3
-    """Largest disagreement of two-sided differences, in deviations; more is a break-away."""
+    """Largest disagreement of two-sided differences, in deviations; more is a break-away: such a
+    disagreement is no noise, since both runs have the same."""
     considered_step: float = 0.125
     """Change of a considered parameter for its effect, in its deviations: half a deviation of oil
     at -20 °C changes the pressure by less than its noise, as a break-away does not."""
@@ -259,7 +262,8 @@ def capped_cost(residuals: Array) -> float:
 RUN_BLOCK_SIZE = 16
 """Candidates that a kernel runs side by side, 1 (ADR 22): runs come in blocks of that size."""
 MIN_SINGULAR_RATIO = 1e-6
-"""Singular value, over the largest, below which a direction is not seen."""
+"""Singular value, over the largest, below which a direction is not seen, 1: its square is a
+thousand times the rounding of a double."""
 
 
 class ParameterDensity(msgspec.Struct, frozen=True, eq=False):

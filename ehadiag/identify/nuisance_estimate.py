@@ -22,16 +22,14 @@ from ehadiag.identify.estimates import (
     friction_by_exponent,
     independent_covariance,
     is_near,
-    is_pressure_misfit,
     is_unexplainable,
     likelihood_ratio_cost,
+    misses_only_pressure,
     signal_excess_costs,
 )
 from ehadiag.identify.experiment import (
     Experiment,
-    lay_out_spans,
     residuals_by_experiment,
-    unknowns_of,
     with_residual_noise,
 )
 from ehadiag.identify.least_squares import Refinement, refined_with_day, refinement_at
@@ -49,27 +47,22 @@ from ehadiag.identify.nuisance_search import (
     NuisanceSearchSettings,
     StagedSearchResult,
     free_run_model,
-    is_calibrated_oil,
     noise_scaled_model,
     search_in_stages,
 )
 from ehadiag.identify.partial_refinement import considered_parameters
 from ehadiag.identify.posterior import (
-    BRIEF_SCHEDULE,
-    FEW_UNKNOWNS_SCHEDULE,
-    FINAL_SCHEDULE,
     PosteriorResult,
     cauchy_cost,
     cauchy_costs,
     no_interruption,
     search_posterior,
 )
-from ehadiag.identify.prior import UnitPrior, density_about, prior_density, prior_information
+from ehadiag.identify.prior import UnitPrior, prior_density, prior_information
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.plant import slip_speed
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter
-from ehadiag.model.residual_models import SimdModel
 from ehadiag.model.severities import FAULT_LAWS
 
 HYSTERESIS_NAME = "hysteresis"
@@ -93,8 +86,6 @@ class NuisanceEstimate(msgspec.Struct, frozen=True, eq=False):
     """Covariance by several optima of like cost, SI, besides that of the refinement; shape (k,
     k)."""
     explained: bool
-    confirmed: bool
-    """See `ehadiag.identify.nuisance_search.MultistartResult`."""
     excess: float
     """See `ehadiag.identify.estimates.excess_cost`."""
     starts: int
@@ -160,27 +151,18 @@ def estimate_about(
     alone = settings.joint is None and all(
         item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
     )
-    given_up = not found.explained and (
-        is_unexplainable(found.residuals, found.starts) or (alone and not is_near(found.residuals))
-    )
-    if not (settings.give_up and given_up):
+    hopeless = misses_only_pressure(found.residuals) or not is_near(found.residuals)
+    if found.explained or not (settings.give_up and hopeless):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
-        found_oil = found.explained and is_calibrated_oil(experiments, settings.joint)
         progress = settings.progress
         search = partial(
             search_posterior,
             prior=prior,
             information=information,
             linearise=partial(linearised_by_regression, rng=rng),
-            schedule=BRIEF_SCHEDULE if found_oil else FINAL_SCHEDULE,
             between=no_interruption if progress is None else partial(progress, 1.0),
         )
         if not alone:
-            if settings.require_agreement and not (found.confirmed or found_oil):
-                # A break-away may stand between the end of the search and the optimum.
-                density = _search_about(
-                    fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain
-                )
             density = _search_about(fine, search, density, RESTARTS.end_spread * density.root)
         else:
             late, begin = fine, replace(density, root=RESTARTS.end_spread * density.root)
@@ -218,7 +200,6 @@ def estimate_about(
         experiments=judged,
         covariance=covariance,
         explained=settings.explains(refined.residuals),
-        confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
         starts=found.starts,
         evaluations=evaluations + fine.evaluations,
@@ -269,19 +250,15 @@ def _with_judged_noise(experiments: Sequence[Experiment], residuals: Array) -> l
 
 
 def _search_about(
-    fine: Derivatives,
-    search: PosteriorSearch,
-    there: ParameterDensity,
-    root: Array,
-    least_gain: float = 0.0,
+    fine: Derivatives, search: PosteriorSearch, there: ParameterDensity, root: Array
 ) -> ParameterDensity:
-    """Search about a density; the end of it if that is better by a least gain, else the density.
+    """Search about a density; the end of it if that is better, else the density.
 
     root: of the covariance over which it searches.
     """
     seen = search(fine, begin=ParameterDensity(there.x, root)).density
     costs = cauchy_cost(fine.many(np.vstack([there.x, seen.x])))
-    return seen if costs[0] - costs[1] > least_gain else there
+    return seen if costs[0] > costs[1] else there
 
 
 def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
@@ -324,29 +301,6 @@ def _ends_covariance(found: MultistartResult, scale: Array) -> Array:
     return np.asarray(shifts.T @ shifts / len(alike))
 
 
-TRIAL_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
-
-
-def would_effect_explain(effect: Parameter, found: NuisanceEstimate) -> bool:
-    """Whether an effect that is not free may explain the residuals of an estimate.
-
-    Some rounds of the search from the estimate, over a tenth of the usual width: some 100 runs of
-    the model.
-    """
-    experiments = found.experiments
-    unknowns = unknowns_of(experiments, (*found.refined.parameters, effect))
-    model = Derivatives(SimdModel(lay_out_spans(experiments), unknowns), experiments[0].noise)
-    first = prior_density(model, {})
-    begin = density_about(model, first, found.refined.values)
-    linearise = partial(linearised_by_regression, rng=np.random.default_rng(0))
-    there = search_posterior(
-        model, first, begin, prior_information(model, {}), linearise, TRIAL_SCHEDULE
-    ).density
-    return excess_cost(model.many(there.x[None, :])[0]) - 1.0 <= GIVE_UP.max_trial_share * (
-        found.excess - 1.0
-    )
-
-
 def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEstimate:
     """The further estimate if it explains more of the recordings, with the effort of both."""
     more = further.explained or (not found.explained and further.excess < found.excess)
@@ -356,6 +310,11 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
         evaluations=found.evaluations + further.evaluations,
         starts=found.starts + further.starts,
     )
+
+
+def _is_hopeless(residuals: Array) -> bool:
+    """Whether another kind of search will not explain what one leaves either."""
+    return is_unexplainable(residuals) or misses_only_pressure(residuals)
 
 
 class NuisanceEstimator(msgspec.Struct, frozen=True):
@@ -369,26 +328,25 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Called repeatedly with the share of a search's budget that is spent."""
 
     def estimated(
-        self, experiments: Sequence[Experiment], hint: Mapping[str, float] | None, before: float
+        self, experiments: Sequence[Experiment], hint: Mapping[str, float] | None
     ) -> NuisanceEstimate:
         """Estimate severities and all free parameters from recordings of one actuator.
 
-        hint: values by name near which the optimum probably lies; before: excess of the severities
-        alone.
+        hint: values by name near which the optimum probably lies.
         """
         calibrated = self.prior.joint is not None
         if calibrated and any(slip_speed(item.constants) > 0.0 for item in experiments):
-            return self._of_oil(experiments, hint, before)
+            return self._of_oil(experiments, hint)
         creeps = [item.creeps for item in experiments]
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
-        found = self._with(experiments, self.prior, hint, before, budget=budget)
-        if any(creeps) and not (found.explained or found.confirmed):
-            followed = self._with(experiments, self.prior, hint, before, follow=True)
+        found = self._with(experiments, self.prior, hint, budget=budget)
+        if any(creeps) and not (found.explained or _is_hopeless(found.refined.residuals)):
+            followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
         if not found.explained and begins_as_read:
-            found = self._from_origin(experiments, found, hint, before)
+            found = self._from_origin(experiments, found, hint)
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
@@ -400,7 +358,6 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         experiments: Sequence[Experiment],
         found: NuisanceEstimate,
         hint: Mapping[str, float] | None,
-        before: float,
     ) -> NuisanceEstimate:
         """Estimate with the spool's origin less the offset that was found, if that explains more.
 
@@ -409,7 +366,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         """
         offset = found.refined.values["spool_offset"]
         moved = [item.with_origin(offset) for item in experiments]
-        return _better_of(found, self._with(moved, self.prior, hint, before))
+        return _better_of(found, self._with(moved, self.prior, hint))
 
     def _loosened(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,
@@ -424,12 +381,12 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         hint: Mapping[str, float] | None, budget: int = NUISANCE_RUN_BUDGET,
     ) -> NuisanceEstimate:  # fmt: skip
         """Estimate where effects may have changed; the same where what is left is of no change."""
-        if found.explained or found.excess <= GIVE_UP.max_unchanged_excess:
+        if found.explained or found.excess <= FIT.max_explained_excess:
             return found
         return self._with(experiments, self.prior.loosened(), hint, budget=budget)
 
     def _of_oil(
-        self, experiments: Sequence[Experiment], hint: Mapping[str, float] | None, before: float
+        self, experiments: Sequence[Experiment], hint: Mapping[str, float] | None
     ) -> NuisanceEstimate:
         """Estimate a calibrated unit with oil in its second stage.
 
@@ -437,7 +394,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         by the friction found. A calibration leaves it out by the friction as new; a worn jack slips
         at up to twenty times that speed.
         """
-        settings, considered = self._search(experiments, self.prior, hint, before, budget=1)
+        settings, considered = self._search(experiments, self.prior, hint, budget=1)
         staged = search_in_stages(experiments, settings)
         if staged.found.explained:
             found = estimate_about(experiments, settings, staged, considered)
@@ -448,7 +405,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             slip_speed(item.constants, min(max(values["FDJ"], 0.0), 1.0)) for item in experiments
         )
         sliding = [item.sliding(slow) for item in experiments]
-        found = self._with(sliding, self.prior, values, before)
+        found = self._with(sliding, self.prior, values)
         loose = self._with_changed_effects(sliding, found, values, budget=1)
         better, doubted = self._other_exponent(sliding, found, loose)
         if better is None and explains_far_more(loose.excess, found.excess):
@@ -528,15 +485,12 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         self, experiments: Sequence[Experiment], found: NuisanceEstimate
     ) -> NuisanceEstimate:
         """Estimate a constant load, too, where that explains what the other effects do not."""
-        load = parameter("load")
-        if found.excess > GIVE_UP.max_load_trial_excess or is_pressure_misfit(
-            found.refined.residuals
-        ):
-            return found
-        if not would_effect_explain(load, found):
+        left = found.refined.residuals
+        if not (misses_only_pressure(left) and is_near(left)):
             return found
         values = found.refined.values
-        more = self._with(experiments, self.prior, values, found.excess, (load,))
+        load = (parameter("load"),)
+        more = self._with(experiments, self.prior, values, load, budget=1)
         return _better_of(found, more)
 
     def _with(
@@ -544,13 +498,12 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         experiments: Sequence[Experiment],
         prior: UnitPrior,
         hint: Mapping[str, float] | None,
-        before: float = float("inf"),
         further: tuple[Parameter, ...] = (),
         budget: int = NUISANCE_RUN_BUDGET,
         *,
         follow: bool = False,
     ) -> NuisanceEstimate:
-        settings, considered = self._search(experiments, prior, hint, before, further, budget)
+        settings, considered = self._search(experiments, prior, hint, further, budget)
         settings = replace(settings, follow=follow)
         return estimate_nuisances(experiments, settings, considered)
 
@@ -559,7 +512,6 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         experiments: Sequence[Experiment],
         prior: UnitPrior,
         hint: Mapping[str, float] | None,
-        before: float = float("inf"),
         further: tuple[Parameter, ...] = (),
         budget: int = NUISANCE_RUN_BUDGET,
     ) -> tuple[NuisanceSearchSettings, tuple[ConsideredParameter, ...]]:
@@ -575,10 +527,8 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             progress=self.progress,
             # Of other units the first starts may leave as much as of an unknown effect.
             give_up=prior.explains_sound_units,
-            soon=not prior.has_inexact_data,
             explains=prior.explains,
-            require_agreement=any(item.test.closed_loop for item in experiments),
-            excess_before=before,
+            goes_slow=any(item.test.closed_loop for item in experiments),
             leave_creep_out=True,
         )
         return settings, considered_parameters(experiments, free)

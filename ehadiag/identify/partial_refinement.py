@@ -1,9 +1,6 @@
 """Refinement of the severities alone, of a unit assumed to match its data file.
 
-It begins on the first part of a test while that runs; the last part adds a step.
-
-The optimum of the first part stands with its normal matrix; one Gauss-Newton step on the residuals
-of the last part leads to the optimum of the whole (a measurement update of the information filter).
+It begins on the first part of a test while that runs; two rounds on the whole lead from there.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP
+from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.identify.experiment import (
     ANCHOR_THRESHOLDS_LSB,
     Experiment,
@@ -29,7 +26,6 @@ from ehadiag.identify.least_squares import (
     NEAR,
     SEARCH_OPTIMUM_STD,
     Refinement,
-    deviations,
     last_round,
     median_offsets,
     near_spread,
@@ -42,17 +38,12 @@ from ehadiag.identify.linearisation import (
     ConsideredParameter,
     CoordinateCross,
     Derivatives,
-    ParameterDensity,
-    ResidualSlope,
 )
 from ehadiag.identify.posterior import (
-    FEW_UNKNOWNS_SCHEDULE,
-    bounded_step,
     no_interruption,
 )
 from ehadiag.identify.solvers import SearchResult
 from ehadiag.identify.staged_search import (
-    RUN_IN_S,
     STAGE_SHARES,
     first_approximation_ready_at,
     stage_ready_at,
@@ -78,9 +69,6 @@ class FirstPart(msgspec.Struct, frozen=True, eq=False):
     refined: Refinement
     noise: tuple[tuple[float, ...], ...]
     """Of the signals of each test (m, Pa, m), as the residuals show it."""
-    levels: NDArray[np.int64]
-    """How a model of these spans cuts its ticks (`ehadiag.model.residual_models.SimdModel`); shape
-    (N,)."""
     evaluations: int
     """Runs of the model in all."""
 
@@ -160,7 +148,7 @@ def refine_first_part(
         )
         evaluations += best.evaluations
     noise = tuple(item.noise for item in experiments)
-    return FirstPart(best, noise, levels, evaluations)
+    return FirstPart(best, noise, evaluations)
 
 
 def free_run_residuals(
@@ -290,99 +278,36 @@ def _with_judged_noise(
     return [with_residual_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
 
 
-LAST_PART_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, most_rounds=4, whole_rounds=2)
-"""Rounds of the whole where it is refined, four at most: the test is over by then, and the verdict
-awaited; to refine the whole from the start brought nothing (ADR 13 at 76e9001c)."""
+WHOLE_TEST_ROUNDS = 2
+"""Rounds on the whole test from the optimum on its first part, 1: one for most recordings."""
 
 
 def add_last_part(
-    experiments: Sequence[Experiment], until: Sequence[int], first_part: FirstPart
-) -> Refinement | None:
-    """Optimum on all of the tests from that on their first parts; None where it is elsewhere.
+    experiments: Sequence[Experiment],
+    first_part: FirstPart,
+    between: Callable[[], None] = no_interruption,
+) -> Refinement:
+    """Optimum on all of the tests from that on their first parts.
 
-    experiments: with the noise as the first part shows it; until: ticks of the first part of each
-    test.
+    A round leads there, with oil and supply free, and where it steps by more than a deviation a
+    second one; where that does, too, all is refined. experiments: with the noise as the first part shows it.
     """
-    first, rows = first_part.refined, _PartRows.of(experiments, until)
-    levels = np.full(sum(item.ticks for item in experiments), -1, dtype=np.int64)
-    levels[rows.first] = first_part.levels
-    if len(rows.last):
-        last = anchored_model(experiments, rows.spans, lead=RUN_IN_S)
-        levels[rows.last] = last.levels[rows.counted]
+    first = first_part.refined
+    ends = [item.ticks for item in experiments]
+    levels = start_residuals(experiments, ends, first.values).levels
     whole = anchored_derivatives(experiments, levels=levels)
-    x, normal, settled = first.x * first.scale / whole.scale, first.normal, first.converged
-    others: list[Array] = []
-    evaluations = 0
-    if len(rows.last):
-        model = anchored_model_derivatives(last, experiments)
-        slope = model.trusted_slope(x)
-        taken = slope.used & (last.batch.weight > 0.0)
-        moved, normal = _last_part_step(x, first, slope, taken, model)
-        step = np.tensordot(moved - x, first.jacobian, 1)
-        if np.vdot(step, step) > GIVE_UP.max_last_part_step**2:
-            return None
-        std = deviations(first.normal)
-        others, evaluations = [x], model.evaluations
-        if np.any(np.abs(moved - x)[whole.faults] > GIVE_UP.max_severity_step * std[whole.faults]):
-            start = whole.named(moved)
-            width = FEW_UNKNOWNS_SCHEDULE.width * (std * whole.scale)[whole.curved]
-            found = refine_severities(whole, start, width, schedule=LAST_PART_SCHEDULE)
-            others, moved, normal, settled = [], found.x, found.normal, found.converged
-        x = moved
-    width = FEW_UNKNOWNS_SCHEDULE.width * deviations(normal)[whole.curved]
-    root = np.diag(np.minimum(width, SEARCH_OPTIMUM_STD / whole.scale[whole.curved]))
-    found, (cost, *before) = last_round(whole, ParameterDensity(x, root), settled, *others)
-    if before and cost > before[0] + GIVE_UP.max_cost_rise:
-        found, _ = last_round(whole, ParameterDensity(others[0], root), settled)
-    return replace(found, evaluations=evaluations + found.evaluations)
-
-
-def _last_part_step(
-    x: Array, first: Refinement, slope: ResidualSlope, taken: NDArray[np.bool_], model: Derivatives
-) -> tuple[Array, Array]:
-    """Step by the residuals of the last part, and the information of both parts.
-
-    taken: rows that count, shape (signals, n).
-    """
-    now = slope.jacobian[:, taken]
-    stands = np.tensordot(first.jacobian, first.residuals, 2)
-    pulls = now @ slope.residuals[taken]
-    # At the optimum of the first part the gradient is 0, but into a bound.
-    at_bound = (x == model.lower) | (x == model.upper)
-    normal = first.normal + now @ now.T + NEAR.min_information * np.eye(len(x))
-    gradient = np.where(at_bound, stands, 0.0) + pulls
-    return bounded_step(x, normal, gradient, model.lower, model.upper), normal
-
-
-class _PartRows(msgspec.Struct, frozen=True, eq=False):
-    """Ticks of first and last parts among those of all tests.
-
-    spans: s, the last part of each test; none of one that ends too early. first, last: ticks of the
-    whole tests. counted: the last parts among the ticks of their own batch, which have a run-in.
-    """
-
-    spans: list[list[tuple[float, float]]]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
-    counted: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, experiments: Sequence[Experiment], ends: Sequence[int]) -> _PartRows:
-        """Rows of the tests one behind the other."""
-        spans: list[list[tuple[float, float]]] = []
-        first, last, counted = [], [], []
-        begin = run = 0
-        for item, until in zip(experiments, ends, strict=True):
-            first.append(begin + np.arange(until))
-            spans.append([])
-            if item.ticks - until > 1:
-                spans[-1].append((until * item.tick, item.ticks * item.tick))
-                last.append(begin + np.arange(until, item.ticks))
-                lead = min(round(RUN_IN_S / item.tick), until)
-                counted.append(run + lead + np.arange(item.ticks - until))
-                run += lead + item.ticks - until
-            begin += item.ticks
-        return cls(spans, *(np.concatenate([np.zeros(0, int), *p]) for p in (first, last, counted)))
+    found = first
+    for _ in range(WHOLE_TEST_ROUNDS):
+        before = found
+        density = start_density(whole, before.values, near_spread(before))
+        found = last_round(whole, density, settled=True)
+        if found.converged:
+            break
+    else:
+        rest = refine_severities(whole, before.values, near_spread(before), between)
+        density = start_density(whole, rest.values, near_spread(rest))
+        found = last_round(whole, density, settled=rest.converged)
+    return replace(found, evaluations=1 + found.evaluations)
 
 
 class SeverityAttempt(msgspec.Struct, frozen=True, eq=False):
@@ -404,16 +329,8 @@ def refined_attempt(
 ) -> SeverityAttempt:
     """Refine whole tests from their first parts, after a search; what `between` raises between
     rounds ends it."""
-    until = [first_part_ticks(item) for item in experiments]
     judged = first.judged(experiments)
-    best = add_last_part(judged, until, first)
-    if best is None:
-        ends = [item.ticks for item in experiments]
-        whole = refine_first_part(experiments, ends, first.refined.values, between)
-        judged = whole.judged(experiments)
-        best = add_last_part(judged, ends, whole)
-        assert best is not None  # no part is left that could lead away
-        best = replace(best, evaluations=best.evaluations + whole.evaluations)
+    best = add_last_part(judged, first, between)
     evaluations = first.evaluations + best.evaluations
     return SeverityAttempt(found, best, judged, evaluations)
 

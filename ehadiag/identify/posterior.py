@@ -14,11 +14,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, GIVE_UP, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, NUMERICAL_ZERO, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
-
-MIN_GRADIENT_SHARE = 1e-9
-"""Share of the largest gradient that counts as none."""
 
 
 def bounded_step(x: Array, normal: Array, gradient: Array, lower: Array, upper: Array) -> Array:
@@ -31,7 +28,7 @@ def bounded_step(x: Array, normal: Array, gradient: Array, lower: Array, upper: 
     out = x - np.linalg.solve(normal, gradient)
     if np.all((out >= lower) & (out <= upper)):
         return out
-    allowed = MIN_GRADIENT_SHARE * float(np.abs(gradient).max(initial=0.0))
+    allowed = NUMERICAL_ZERO * float(np.abs(gradient).max(initial=0.0))
     held = np.zeros(len(x), dtype=np.bool_)
     ends = x.copy()
     for _ in range(4 * len(x) + 4):
@@ -76,37 +73,28 @@ class SearchSchedule(msgspec.Struct, frozen=True):
     settled_step: float
     """Ratio of the widths, and step in units of them, of a round at convergence."""
     most_rounds: int
-    whole_rounds: int
-    """Rounds that are taken whole. Of the first after them half is taken, of the next a third, and
-    so on (Robbins, Monro, Annals of Mathematical Statistics 22(3), 1951): where the cost has steps
-    as wide as the density, rounds would oscillate about its mean for ever."""
-    flat: float
+    averaged_rounds: int = 0
+    """Last rounds that are averaged: of the first half is taken, of the next a third, and so on
+    (Robbins, Monro, Annals of Mathematical Statistics 22(3), 1951): where the cost has steps as
+    wide as the density, rounds would oscillate about its mean for ever."""
+    flat: float = 0.0
     """By how much the objective differs where it is the same (a parameter one deviation off costs
     1), so that the search ends, and at the best place seen; 0: it does not go by the objective."""
     width: float = 2.0
     """Width of the density, in deviations of the linear problem."""
-    coarse: float = np.inf
-    """Objective over the number of samples beyond which `flat` grows in proportion to it, 1."""
 
 
 MANY_UNKNOWNS_SCHEDULE = SearchSchedule(
-    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000,
-    flat=GIVE_UP.same_end_cost,
+    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0
 )  # fmt: skip
 """Schedule for many unknowns, fast: with a half as least ratio 9 of 54 hard starts came to the
 optimum, in 360 runs each, and slow ones follow where it does not (ADR 8)."""
-SLOW_SCHEDULE = replace(
-    MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, whole_rounds=70, width=3.0
-)
+SLOW_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, least_ratio=0.85, most_rounds=70, width=3.0)
 """The same, where break-aways lead a faster search astray. Of 54 starts on nine recordings that are
 hard (closed loop, little hysteresis) 38 came to the optimum, with 700 runs each; with a ratio of
 0.75 19, with 480 runs; of 0.65 9, with 360; of 0.9 42, with 970."""
-FINAL_SCHEDULE = replace(MANY_UNKNOWNS_SCHEDULE, most_rounds=12, flat=4.0)
-"""Schedule of a last search, which begins near the optimum."""
-BRIEF_SCHEDULE = replace(FINAL_SCHEDULE, most_rounds=6)
-"""The same where a calibrated unit with oil is explained: its best place is found by then."""
 FEW_UNKNOWNS_SCHEDULE = SearchSchedule(
-    0.2, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0
+    0.2, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, averaged_rounds=3
 )
 """Schedule for few unknowns: until the estimate is independent of the search before. With eight
 rounds, averaged from the sixth on, of estimates by other seeds 85 % were within 0.1 deviations in
@@ -154,7 +142,8 @@ def search_posterior(
             if history.is_flat:
                 density = replace(density, x=history.x)
                 return PosteriorResult(density, linear, True, history.residuals)
-        share = 1.0 / (1 + max(rounds - schedule.whole_rounds, 0))
+        whole = schedule.most_rounds - schedule.averaged_rounds
+        share = 1.0 / (1 + max(rounds - whole, 0))
         density, ratio, step = _narrowed(
             model, linear, prior, density, information, schedule, share
         )
@@ -196,8 +185,8 @@ class _ObjectiveHistory:
     def is_flat(self) -> bool:
         """Whether the last rounds had the same objective several times."""
         late = sorted(self._objectives[-STALLED_ROUNDS:])[:STALLED_PLACES]
-        flat = self._schedule.flat * max(self._unit / self._schedule.coarse, 1.0)
-        return len(late) == STALLED_PLACES and late[-1] - late[0] < flat * max(self._unit, 1.0)
+        flat = self._schedule.flat * max(self._unit, 1.0)
+        return len(late) == STALLED_PLACES and late[-1] - late[0] < flat
 
 
 def cauchy_cost(residuals: Array) -> Array:

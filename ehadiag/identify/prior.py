@@ -13,6 +13,7 @@ from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator, Calibration
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.conversion import actuator_channels
+from ehadiag.core.criteria import NUMERICAL_ZERO
 from ehadiag.identify.estimates import (
     ExplanationTest,
     calibrated_explanation_test,
@@ -33,14 +34,16 @@ where it saturates the search may stop at a wrong pair."""
 
 
 class PriorWidths(msgspec.Struct, frozen=True):
-    """Widths of densities about starts, as shares of the prior's."""
+    """Widths of densities about starts, as shares of the prior's or of an earlier search's."""
 
-    hint: float = 0.1
-    """Spread about a hint, in spreads of the prior."""
-    small_effect: float = 0.2
-    """Spread of nuisances about 0, in spreads of the prior."""
+    near: float = 0.1
+    """Spread about a place that was found, or about no effect, 1: so wide a search found an optimum
+    beyond one break-away (one unit had been 17 deviations off), and one about its end left 1 of 40
+    units beside the optimum, not 13 (ADR 23)."""
     loosened: float = 0.3
-    """Change of an effect since the calibration, in its usual deviations."""
+    """Change of an effect since the calibration, in its usual deviations; spread of what it knows
+    about the end of the spool's search, with 0.1 of which one of 24 recordings was not explained,
+    with 1 a start took up to fifteen rounds."""
 
 
 WIDTHS = PriorWidths()
@@ -102,7 +105,7 @@ def density_about(
 
     known: whether `density` is as narrow as what is known of all but the severities, and stays so.
     """
-    shares = np.where(model.faults | (not known), WIDTHS.hint, 1.0)[model.curved]
+    shares = np.where(model.faults | (not known), WIDTHS.near, 1.0)[model.curved]
     x = np.array([values.get(item.name, 0.0) for item in model.estimated]) / model.scale
     return ParameterDensity(np.clip(x, model.lower, model.upper), shares[:, None] * density.root)
 
@@ -116,7 +119,7 @@ def small_effects_density(model: Derivatives, density: ParameterDensity) -> Para
     """
     faults = np.array([item.kind is ParameterKind.FAULT for item in model.estimated])
     x = np.where(faults, density.x, 0.0)
-    shares = np.where(faults, 1.0, WIDTHS.small_effect)[model.curved]
+    shares = np.where(faults, 1.0, WIDTHS.near)[model.curved]
     return ParameterDensity(np.clip(x, model.lower, model.upper), density.root * shares[:, None])
 
 
@@ -170,7 +173,6 @@ DAILY_PRIORS = {
     item.name: ParameterPrior(0.0, item.day_std) for item in REGISTRY if item.day_std is not None
 }
 """Priors of what no calibration can keep."""
-ALIAS_DIFFERENCE_STEP = 1e-6
 CALIBRATED_SEVERITY_STD = 1e-4
 """Of a severity: what two optima on noise of their own, a calibration's and a diagnosis's, differ
 by beyond their covariances. Errors of calibrated random units were 1.3 to 2.7 times what these
@@ -199,8 +201,8 @@ class DatumAlias(msgspec.Struct, frozen=True):
         points = np.array(
             [
                 [0.0, severity],
-                [ALIAS_DIFFERENCE_STEP, severity],
-                [0.0, severity + ALIAS_DIFFERENCE_STEP],
+                [NUMERICAL_ZERO, severity],
+                [0.0, severity + NUMERICAL_ZERO],
             ]
         )
         there, datum, fault = unknowns.candidates(points)[:, 0]

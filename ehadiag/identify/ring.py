@@ -25,20 +25,19 @@ from ehadiag.model.residual_models import SimdModel
 class RingScan(msgspec.Struct, frozen=True):
     """Range, step and criteria of the scan of the oil's stiffness."""
 
-    least: float = -0.6
-    """Least relative change of the stiffness, 1: beyond half of it, a total volume in the file."""
-    most: float = 1.3
-    """Largest relative change of the stiffness, 1: beyond twice, half the volume."""
     step: float = 2.5e-3
     """Step of the scan, 1: a quarter of the width of a valley, which is half a period in forty."""
     still_s: float = 0.1
-    """Time for which the current has not changed, s: nothing but the ring moves."""
+    """Time for which the current has not changed, s: nothing but the ring moves; as long as the
+    run-in before a window."""
     cap: float = 400.0
-    """Largest square of one residual, in variances."""
+    """Largest square of one residual, in variances, 20 deviations: a ring out of phase counts in
+    full, a break-away does not decide."""
     std: float = 4e-3
     """Standard deviation of the ratio of stiffness and mass, 1: the width of a valley."""
     max_cost_ratio: float = 0.6
-    """Largest cost of the best valley over the median, 1, for a ring that shows."""
+    """Largest cost of the best valley over the median, 1, for a ring that shows: in phase nothing
+    of it is left, at random twice its variance, so a ring of a third of the noise's makes it."""
     max_factor_error: float = 0.15
     """Largest relative error of the stiffness, against 2 or 1/2, for a volume of the other
     meaning, 1: data 5 % off in bulk modulus, volume and mass make 0.09."""
@@ -117,7 +116,12 @@ def find_ring(experiments: Sequence[Experiment], values: Mapping[str, float]) ->
     still &= batch.weight[PRESSURE_ROW] > 0.0
     if not still.any():
         return None
-    stiffness = np.arange(SCAN.least, SCAN.most, SCAN.step)
+    # From half the stiffness, a total volume in the file, to twice.
+    least, most = (
+        0.5 * (1.0 - SCAN.max_factor_error) - 1.0,
+        2.0 * (1.0 + SCAN.max_factor_error) - 1.0,
+    )
+    stiffness = np.arange(least, most, SCAN.step)
     points = np.zeros((len(stiffness), len(free)))
     points[:, :-1] = [values[name] for name in names]
     points[:, -1] = stiffness

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import ESTIMATION, RECORDING
+from ehadiag.core.criteria import ESTIMATION, NUMERICAL_ZERO, RECORDING
 from ehadiag.model.laws import ControlLaw, control_currents, control_law
 from firmware_iface.recording import CHANNELS, Acquisition, Channel, Channels, CommandMode, Samples
 from firmware_iface.stored_test import Controller, StoredTest
 
-QUIET_BLOCK_TICKS = 100
-"""Ticks over which noise is judged."""
 QUIET_BLOCK_RATIO = 0.867
-"""Deviation of white noise in the quietest fifth of such blocks (0.864 to 0.869 for 2 to 5.5 s)."""
+"""Deviation of white noise in the quietest fifth of blocks of `ESTIMATION.min_ticks`, 1 (0.864 to
+0.869 for 2 to 5.5 s; a tenth of a chi-square of the 51 degrees of freedom of second differences has
+0.870)."""
 
 
 def rounding_noise(channel: Channel) -> float:
@@ -39,10 +39,10 @@ def noise_of_signal(values: Array, channel: Channel) -> float:
     actuator rests or creeps. Never below what the converter's rounding alone makes.
     """
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
-    blocks = second[: len(second) // QUIET_BLOCK_TICKS * QUIET_BLOCK_TICKS].reshape(
-        -1, QUIET_BLOCK_TICKS
+    blocks = second[: len(second) // ESTIMATION.min_ticks * ESTIMATION.min_ticks].reshape(
+        -1, ESTIMATION.min_ticks
     )
-    enough = np.isfinite(blocks).sum(axis=1) > QUIET_BLOCK_TICKS // 2
+    enough = np.isfinite(blocks).sum(axis=1) > ESTIMATION.min_ticks // 2
     if not enough.any():
         return float(channel.lsb * ESTIMATION.noise_lsb)
     power = np.sort(np.nanmean(blocks[enough] ** 2, axis=1)) / 6.0
@@ -79,15 +79,15 @@ class CommandRules(msgspec.Struct, frozen=True):
     """Reconstruction of commands and currents."""
 
     min_misfit_gain: float = 30.0
-    """Least gain in the sum of squares of a rounding over none, in variances."""
+    """Least gain in the sum of squares of a rounding over none, in variances: a
+    likelihood ratio of e^15, whichever of 21 resolutions is tried."""
     max_guessed_ticks: int = 50
     """Largest number of ticks of a hole that count as guessed, 1: in a longer one there is no
     sample either that a wrong current could affect. An integral in the control law keeps all of
     them."""
-    code_tolerance_lsb: float = 1e-6
-    """Rounding of the converter's own values, LSB."""
     rescaled_tolerance_lsb: float = 0.1
-    """Rounding of values that a bus of another scale rounded once more, LSB."""
+    """Rounding of values that a bus of another scale rounded once more, LSB: a fifth of half a
+    step, so that the nearest step is the converter's."""
 
 
 COMMANDS = CommandRules()
@@ -179,11 +179,15 @@ def commanded_current(
     if difference.size == 0:
         return CurrentTrace(current, float("nan"), 0.0, True, command_deviation, guessed, step)
     offset = float(np.median(difference))
-    # A handful of ticks may be far off where samples were lost: compare most of them.
-    spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
-    residual_lsb = float(np.sqrt(np.mean(spread**2))) / channels.current.grain
+    residual_lsb = _kept_rms(difference - offset) / channels.current.grain
     rebuilt = residual_lsb < RECORDING.max_control_residual_lsb
     return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed, step)
+
+
+def _kept_rms(away: Array) -> float:
+    """Rms of all but the largest values: a handful of ticks may be of lost samples."""
+    kept = max(1, int(ESTIMATION.noise_kept_share * away.size))
+    return float(np.sqrt(np.mean(np.sort(np.abs(away))[:kept] ** 2)))
 
 
 def command_of(
@@ -245,7 +249,7 @@ def _as_digitised(position: Array, lsb: float) -> Array:
     away = np.abs(position - nearest)[np.isfinite(position)] / lsb
     if (
         away.size == 0
-        or away.max() < COMMANDS.code_tolerance_lsb
+        or away.max() < NUMERICAL_ZERO
         or np.quantile(away, 0.99) > COMMANDS.rescaled_tolerance_lsb
     ):
         return position
@@ -323,22 +327,17 @@ class CodeLimits(msgspec.Struct, frozen=True):
     """Limits by which a current tells the code of the position that it follows."""
 
     linear: float = 0.95
-    """Largest demand at which the current follows the position, of the rated current, 1."""
+    """Largest demand at which the current follows the position, of the rated current, 1: a
+    twentieth below it the noise of a current does not reach it."""
     limited: float = 1.2
     """Least demand at which the current stands at its limit, of the rated current, 1: noise of the
     position does not bring it back."""
-    min_ticks: int = 100
-    """Least number of such ticks, 1."""
-    min_limited_ticks: int = 10
-    """Least number of ticks at the limit that show the offset of the current, 1."""
     min_concentration: float = 0.5
     """Least mean of the positions' phases within a code, 1: 0.9 for noise of half a step of a
     12-bit current, 0.5 where it deviates by 0.19 codes, beyond which neighbours are mixed up."""
     max_spread_codes: float = 2.0
     """Largest deviation of the position measured from that acted on, in codes of the computer's
     converter, 1: half a code of noise and rounding by both, and some of motion between them."""
-    trim: float = 0.98
-    """Share of the ticks that the spread is of, 1: a handful may be of another tick."""
 
 
 CODES = CodeLimits()
@@ -366,10 +365,10 @@ def acquired_current(
     limit = controller.IM
     limited = np.isfinite(measured) & (np.abs(demand) > CODES.limited * limit)
     offset = 0.0
-    if limited.sum() >= CODES.min_limited_ticks:
+    if limited.sum() >= ESTIMATION.min_samples:
         offset = float(np.median(measured[limited] - np.copysign(limit, demand[limited])))
     linear = np.isfinite(measured) & (np.abs(measured - offset) < CODES.linear * limit)
-    if linear.sum() < CODES.min_ticks:
+    if linear.sum() < ESTIMATION.min_ticks:
         return _as_measured(measured, command, offset, controller, deviation, step)
     acted = command - measured / controller.GAP
     seen, shift = acted + offset / controller.GAP, 0.0
@@ -396,12 +395,8 @@ def acquired_current(
     known = np.isfinite(current)
     current = np.where(known, current, np.interp(_ticks(current), _ticks(current)[known],
                                                  current[known]))  # fmt: skip
-    left = np.sort(np.abs(away - middle)[np.isfinite(away)])
-    left = left[: max(1, int(CODES.trim * left.size))]
-    spread = float(np.sqrt(np.mean(left**2)))
-    rest = np.sort(np.abs(measured - current - offset)[np.isfinite(measured)])
-    rest = rest[: max(1, int(CODES.trim * rest.size))]
-    residual = float(np.sqrt(np.mean(rest**2)))
+    spread = _kept_rms((away - middle)[np.isfinite(away)])
+    residual = _kept_rms((measured - current - offset)[np.isfinite(measured)])
     if spread > CODES.max_spread_codes * code:
         residual = controller.GAP * spread
     return CurrentTrace(

@@ -38,21 +38,16 @@ class StageRules(NamedTuple):
 
     coarse_points: int = 2 * RUN_BLOCK_SIZE
     """Points of the coarse search over 0 … 1: two blocks of runs."""
-    repeated_ranges: tuple[tuple[float, float], ...] = ((0.2, 0.06), (0.05, 0.02))
-    """Half-widths of the repeated searches in the slewing and the creeping spool, 1."""
+    repeated_range: float = 0.2
+    """Half-width of the second search in the slewing and the creeping spool, 1: with the other
+    severity wrong the first one may be as far off; a third search brought nothing (ADR 24)."""
     fine_points: int = RUN_BLOCK_SIZE
     """Points of a finer grid, 1: a block of runs."""
     finest_spacing: float = 6e-4
-    """Spacing of the last grid, 1."""
-    creep_spacings: tuple[float, ...] = (0.04, 0.01, 6e-4)
-    """Spacing of the last grid of the three searches in the creeping spool, 1, whose runs cost
-    most: the refinement looks 0.0004 to 0.002 to either side (ADR 11 at c48f0620)."""
-    jack_spacing: float = 4.5e-3
-    """Spacing of the last grid in the driven jack, 1, whose cost is nearly a parabola."""
-    jack_sweeps: int = 3
-    """Sweeps over the severities that the driven jack shows, 1, where there are several."""
-    first_run_in_s: float = 0.05
-    """Run-in of the first approximation, s."""
+    """Spacing of the last grid, 1: the refinement looks 0.0004 to 0.002 to either side (ADR 11 at
+    c48f0620)."""
+    run_in_s: float = 0.05
+    """Run-in before a window, s; with twice as long the answers were the same (ADR 24)."""
     pressure_cap: float = SEARCH_CAP
     """Largest square of a residual of the pressure, in variances, as in the genetic search."""
     spool_cap: float = 100.0
@@ -62,9 +57,10 @@ class StageRules(NamedTuple):
     """Budgets of the solver for all stages together, 1: two generations of half a block a stage
     guard against a wrong basin; accuracy does not need them (ADR 4)."""
     first_deviation: float = 0.004
-    """Standard deviation of the first stage about the first approximation, severities."""
+    """Standard deviation of the first stage about the first approximation, severities: ten times
+    what that is off by in the mean (`tools/study paper`)."""
     narrowing: float = 0.5
-    """Ratio of the deviations of two stages, 1."""
+    """Ratio of the deviations of two stages, 1: each sees more of the test."""
 
 
 SEARCH_STAGES = StageRules()
@@ -122,13 +118,13 @@ def first_approximation_inputs(experiments: Sequence[Experiment]) -> FirstApprox
         slewing=lay_out_spans(
             experiments,
             [_windows_by("slew", test) for test in tests],
-            lead=SEARCH_STAGES.first_run_in_s,
+            lead=SEARCH_STAGES.run_in_s,
             channels=(True, False),
         ),
         creeping=lay_out_spans(
             experiments,
             [_windows_by("creep", test) for test in tests],
-            lead=SEARCH_STAGES.first_run_in_s,
+            lead=SEARCH_STAGES.run_in_s,
             channels=(True, False),
             anchor_lsb=ANCHOR_THRESHOLDS_LSB,
         ),
@@ -136,7 +132,7 @@ def first_approximation_inputs(experiments: Sequence[Experiment]) -> FirstApprox
 
 
 def first_approximation(inputs: FirstApproximationInputs) -> FirstApproximation:
-    """Search what the driven jack shows, then slewing and creeping spool; the latter twice more."""
+    """Search what the driven jack shows, then slewing and creeping spool, these twice."""
     counter = _Counter()
     slewing = Objective(SimdModel(inputs.slewing, inputs.unknowns), cap=np.inf)
     creeping = Objective(SimdModel(inputs.creeping, inputs.unknowns), cap=SEARCH_STAGES.spool_cap)
@@ -164,7 +160,6 @@ def first_approximation(inputs: FirstApproximationInputs) -> FirstApproximation:
         cost: Callable[[Array], Array],
         others: Sequence[str],
         half_width: float | None = None,
-        spacing: float = SEARCH_STAGES.finest_spacing,
     ) -> None:
         """Search one severity with the others as found so far; None: over all its range."""
         held: dict[str, Array | float] = {other: values.get(other, 0.0) for other in others}
@@ -175,20 +170,17 @@ def first_approximation(inputs: FirstApproximationInputs) -> FirstApproximation:
             0.0 if half_width is None else middle - half_width,
             1.0 if half_width is None else middle + half_width,
             SEARCH_STAGES.coarse_points if half_width is None else SEARCH_STAGES.fine_points,
-            spacing,
         )
 
-    for _ in range(SEARCH_STAGES.jack_sweeps if len(jack) > 1 else 1):
+    for _ in jack:  # a sweep over the severities that the driven jack shows for each of them
         for name in jack:
-            search(name, jack_cost, jack, None, SEARCH_STAGES.jack_spacing)
+            search(name, jack_cost, jack)
     spool = (*slew, *creep)
-    for ranges, spacing in zip(
-        ((None, None), *SEARCH_STAGES.repeated_ranges), SEARCH_STAGES.creep_spacings, strict=True
-    ):
+    for half_width in (None, SEARCH_STAGES.repeated_range):
         for name in slew:
-            search(name, slewing, spool, ranges[0])
+            search(name, slewing, spool, half_width)
         for name in creep:
-            search(name, creeping, spool, ranges[1], spacing)
+            search(name, creeping, spool, half_width)
     return FirstApproximation(values, counter.count)
 
 
@@ -211,11 +203,10 @@ def _grid_search(
     low: float,
     high: float,
     points: int,
-    coarsest: float = SEARCH_STAGES.finest_spacing,
 ) -> float:
     """Minimum of a scalar function on [low, high] within 0 … 1.
 
-    Ever finer grids about the lowest point, down to a spacing of `coarsest`, all points of one at
+    Ever finer grids about the lowest point, down to the finest spacing, all points of one at
     once; at last the vertex of the parabola through the three lowest neighbours.
     """
     while True:
@@ -224,7 +215,7 @@ def _grid_search(
         counter.count += points
         best = int(np.argmin(values))
         spacing = float(grid[1] - grid[0])
-        if spacing <= coarsest:
+        if spacing <= SEARCH_STAGES.finest_spacing:
             return _vertex(grid, values, best)
         low, high = float(grid[best]) - spacing, float(grid[best]) + spacing
         points = SEARCH_STAGES.fine_points
@@ -286,15 +277,16 @@ T = TypeVar("T")
 StageProgress = Callable[[str, float], None]
 """Called with the stage and its share done, 0 … 1."""
 
-STAGE_SHARES = (0.25, 0.5, 0.75)
+STAGES = 3
+"""Stages of the genetic search, 1: with the last one a fourth of its window is left, which the test
+runs through while they are worked out (ADR 5)."""
+STAGE_SHARES = tuple((stage + 1) / (STAGES + 1) for stage in range(STAGES))
 """Shares of the window of the genetic search that its stages see.
 
-What comes later is for the last step of the refinement, so that all else is done before the end.
+What comes later is for the last rounds of the refinement, so that all else is done before the end.
 """
 SEVERITY_DEVIATION_SHARES = np.array([law.precision for law in FAULT_LAWS.values()])
 """Deviations of the severities after the first approximation, in proportion to each other."""
-RUN_IN_S = 0.1
-"""Run-in before a window, s."""
 
 
 def _no_progress(_share: float) -> None:
@@ -410,7 +402,7 @@ def _search_stage(
     windows = [
         _first_share(item.test.windows.refinement, STAGE_SHARES[stage]) for item in experiments
     ]
-    batch = lay_out_spans(experiments, windows, lead=RUN_IN_S)
+    batch = lay_out_spans(experiments, windows, lead=SEARCH_STAGES.run_in_s)
     unknowns = unknowns_of(experiments, FAULTS)
     spread = (
         SEARCH_STAGES.first_deviation * SEARCH_STAGES.narrowing**stage * SEVERITY_DEVIATION_SHARES

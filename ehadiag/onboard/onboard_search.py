@@ -91,13 +91,13 @@ class OnboardSearchRules(NamedTuple):
     end."""
     min_noise: float = 0.5
     """Least noise, in units of the plan's: a converter's rounding alone makes more."""
-    min_rest_samples: float = float(ESTIMATION.min_rest_samples)
+    min_rest_samples: float = float(ESTIMATION.min_samples)
     """Least number of samples at rest from which an offset is taken, 1."""
     most_held: float = 20.0
     """Distance of the spool at rest from its mean in closed loop, in units of the plan's noise,
     from which on it is held beside its middle: of seven units the mean was within 9 of the offset,
     and a spool that was held up to 230 off."""
-    run_in_s: float = SEARCH_STAGES.first_run_in_s
+    run_in_s: float = SEARCH_STAGES.run_in_s
     """Run-in before a window, s."""
     std: float = 0.4
     """Standard deviation of a severity at the start of the genetic search, 1: that of the last

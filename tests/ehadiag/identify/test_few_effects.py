@@ -104,7 +104,7 @@ def test_effects_are_loosened_only_where_that_explains_what_the_calibration_does
     monkeypatch.setattr(nuisance_estimate, "considered_parameters", lambda *_: ())
     known = replace(CALIBRATED, aliases=(object(),))
     freeing = nuisance_estimate.NuisanceEstimator(known, effects=(), progress=lambda _share: None)
-    found = freeing.estimated([], None, 9.0)
+    found = freeing.estimated([], None)
     assert found.excess == taken
 
 

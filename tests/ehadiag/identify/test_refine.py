@@ -24,12 +24,7 @@ from ehadiag.identify.least_squares import (
     refinement_at,
     rest_near,
 )
-from ehadiag.identify.linearisation import (
-    LinearModel,
-    ParameterDensity,
-    capped_cost,
-    linearised_on_cross,
-)
+from ehadiag.identify.linearisation import LinearModel, ParameterDensity, linearised_on_cross
 from ehadiag.identify.partial_refinement import anchored_derivatives, free_run_residuals
 from ehadiag.model.registry import FAULT_NAMES, parameter
 from ehadiag.model.registry import FAULTS as SEVERITIES
@@ -158,11 +153,10 @@ def belief(shift=0.0):
 
 def test_the_last_round_estimates_the_oil_of_the_day():
     before, _ = by_the_rounds()
-    after, costs = last_round(whole(), belief(), True)
+    after = last_round(whole(), belief(), settled=True)
     # The density of the oil holds back a little.
     assert np.abs(error(before)).max() > 1.5
     assert np.abs(error(after)).max() < 0.4 * np.abs(error(before)).max()
-    assert costs == [pytest.approx(capped_cost(whole().many(before.x[None])[0]))]
     assert after.converged
     assert not np.any(after.jacobian[:, ~after.used])
     alone = estimate_covariance(replace(after, daily=after.daily[:0]))
@@ -171,7 +165,7 @@ def test_the_last_round_estimates_the_oil_of_the_day():
 
 def test_a_last_round_that_steps_by_more_than_a_deviation_has_not_come_to_rest():
     _, std = by_the_rounds()
-    after, _ = last_round(whole(), belief(3.0), True)
+    after = last_round(whole(), belief(3.0), settled=True)
     assert not after.converged
     assert (np.sqrt(np.diag(estimate_covariance(after))) > 2.0 * std * after.scale)[:3].all()
 
@@ -194,7 +188,7 @@ def test_rounds_near_the_optimum_end_where_a_last_round_does(shift):
     start = replace(before, x=before.x + shift * std).values
     model, sofar = whole(), whole().evaluations
     found = rest_near(model, start, near_spread(before))
-    after, _ = last_round(whole(), belief(), True)
+    after = last_round(whole(), belief(), settled=True)
     np.testing.assert_allclose(error(found), error(after), atol=0.15)
     assert found.evaluations - sofar <= 23  # three rounds of half a block each
     assert found.daily.any(axis=(1, 2)).all()
@@ -203,14 +197,6 @@ def test_rounds_near_the_optimum_end_where_a_last_round_does(shift):
 def test_a_break_away_within_reach_is_no_rest():
     before, _ = by_the_rounds()
     assert rest_near(whole(), before.values, 100.0 * near_spread(before)) is None
-
-
-def test_costs_of_other_points_are_theirs():
-    before, std = by_the_rounds()
-    beside = before.x + std
-    _, costs = last_round(whole(), belief(), False, beside)
-    assert costs[1] == pytest.approx(np.minimum(whole().many(beside[None])[0] ** 2, 9.0).sum())
-    assert costs[1] > costs[0]
 
 
 def test_an_optimum_of_many_unknowns_moves_by_the_oil_of_the_day():

@@ -72,7 +72,7 @@ def test_an_interrupt_stops_the_search(objective):
 
 def test_the_search_is_its_three_steps(objective):
     """A generation at a time, by hand: the digits of the solver, which holds nothing else."""
-    solver = CompactGa(budget=320)
+    solver = CompactGa(budget=160)
     state = compact_ga.initial_state(START, np.full(3, 0.02), 4)
     population = np.empty((solver.samples, 3))
     for generation in range(20):
@@ -85,7 +85,7 @@ def test_the_search_is_its_three_steps(objective):
         )
     found = solver.minimise(objective, START, 0.02, 4)
     np.testing.assert_array_equal(found.best, state.elite)
-    assert (found.cost, found.generations, found.evaluations) == (state.best[0], 20, 320)
+    assert (found.cost, found.generations, found.evaluations) == (state.best[0], 20, 160)
 
 
 def test_other_bounds_scale_the_search():
@@ -109,7 +109,7 @@ def test_other_bounds_scale_the_search():
 
 
 def test_a_budget_below_a_generation_leaves_the_start(objective):
-    found = CompactGa(budget=15).minimise(objective, START, 0.02, 1)
+    found = CompactGa(budget=7).minimise(objective, START, 0.02, 1)
     assert (found.evaluations, found.generations) == (0, 0)
     np.testing.assert_allclose(found.best, START)
     assert found.cost == np.inf
