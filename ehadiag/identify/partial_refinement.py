@@ -290,7 +290,8 @@ def add_last_part(
     """Optimum on all of the tests from that on their first parts.
 
     A round leads there, with oil and supply free, and where it steps by more than a deviation a
-    second one; where that does, too, all is refined. experiments: with the noise as the first part shows it.
+    second one; where that does, too, all is refined. experiments: with the noise as the first part
+    shows it.
     """
     first = first_part.refined
     ends = [item.ticks for item in experiments]
