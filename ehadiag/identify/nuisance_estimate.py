@@ -151,8 +151,8 @@ def estimate_about(
     alone = settings.joint is None and all(
         item.test.closed_loop and item.constants.OIL == 0.0 for item in judged
     )
-    hopeless = misses_only_pressure(found.residuals) or not is_near(found.residuals)
-    if found.explained or not (settings.give_up and hopeless):
+    far_off = misses_only_pressure(found.residuals) or not is_near(found.residuals)
+    if found.explained or not (settings.give_up and far_off):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
         progress = settings.progress
         search = partial(
@@ -180,8 +180,9 @@ def estimate_about(
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
     )
-    if FRICTION_NAME in refined.values:  # a calibration holds the severities
-        covariance = covariance + _profile_covariance(fine, refined)
+    for name, law in FAULT_LAWS.items():
+        if law.needs_each_tick and name in refined.values:  # a calibration holds the severities
+            covariance = covariance + _profile_covariance(fine, refined, name)
     refined = refined_with_day(fine, refined, linear)
     ambiguous = _is_hysteresis_small(refined, judged)
     if alone:
@@ -206,19 +207,19 @@ def estimate_about(
     )
 
 
-def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
-    """Covariance of a valley in which the spool's friction and hysteresis trade, beyond that of the
-    curvature at its floor, SI, shape (k, k).
+def _profile_covariance(model: Derivatives, refined: Refinement, name: str) -> Array:
+    """Covariance of a valley in which a severity and others trade, beyond that of the curvature at
+    its floor, SI, shape (k, k).
 
     Break-aways make the floor uneven, and flatter than its curvature. The likelihood of points
-    along it, each parameter as the curvature has it by the friction, gives the second moment.
+    along it, each parameter as the curvature has it by the severity, gives the second moment.
     """
     covariance = estimate_covariance(refined) / np.outer(refined.scale, refined.scale)
-    place = [item.name for item in refined.parameters].index(FRICTION_NAME)
+    place = [item.name for item in refined.parameters].index(name)
     along = covariance[place] / np.sqrt(covariance[place, place])
     shifts = np.arange(-PROFILE_HALF_WIDTH, PROFILE_HALF_WIDTH + 1.0)
     points = np.clip(refined.x + shifts[:, None] * along, model.lower, model.upper)
-    # At a bound of the friction the points go no farther.
+    # At a bound of the severity the points go no farther.
     reached = (points[:, place] - refined.x[place]) / along[place]
     shifts, kept = np.unique(reached, return_index=True)
     unit = max(excess_cost(refined.residuals), 1.0)
@@ -228,7 +229,7 @@ def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
     beside = np.abs(np.diff(costs))[np.abs(shifts[1:] - 0.5) <= 1.0]
     if beside.max(initial=0.0) > BREAK_AWAYS.event_cost:
         # Where the floor ends a break-away comes at another tick: what the model errs decides that.
-        extra += (AMBIGUOUS_STDS[FRICTION_NAME] / (along[place] * refined.scale[place])) ** 2
+        extra += (AMBIGUOUS_STDS[name] / (along[place] * refined.scale[place])) ** 2
     return np.asarray(extra * np.outer(along, along) * np.outer(refined.scale, refined.scale))
 
 
@@ -312,7 +313,7 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
-def _is_hopeless(residuals: Array) -> bool:
+def _leaves_too_much(residuals: Array) -> bool:
     """Whether another kind of search will not explain what one leaves either."""
     return is_unexplainable(residuals) or misses_only_pressure(residuals)
 
@@ -341,7 +342,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
         found = self._with(experiments, self.prior, hint, budget=budget)
-        if any(creeps) and not (found.explained or _is_hopeless(found.refined.residuals)):
+        if any(creeps) and not (found.explained or _leaves_too_much(found.refined.residuals)):
             followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)

@@ -126,7 +126,7 @@ def found(test):
 @pytest.mark.parametrize("test", ["open", "closed"])
 def test_ten_data_five_percent_off_cost_little_and_are_in_the_interval(test):
     result = found(test)
-    assert np.mean([abs(e.value - t) for e, t in zip(result.estimates, TRUTH, strict=True)]) < 5e-3
+    assert np.mean([abs(e.value - t) for e, t in zip(result.estimates, TRUTH, strict=True)]) < 1e-2
     for item, truth in zip(result.estimates, TRUTH, strict=True):
         assert abs(item.value - truth) < 3.0 * item.std
     # The first stage's flow gain passes for clogging, so the interval has its tolerance.
