@@ -213,8 +213,10 @@ def _density_about_end(
     points = RESTARTS.alias_points if is_near(end.residuals) else RUN_BLOCK_SIZE
     if alias in names and explains_spool(end.residuals):
         root, place = RESTARTS.end_spread * end.density.root, names.index(alias)
-        root[place], root[:, place] = 0.0, 0.0
-        root[place, place] = 2.0 * RESTARTS.alias_half_span / points
+        root[place] = 0.0
+        covariance = root @ root.T
+        covariance[place, place] = (2.0 * RESTARTS.alias_half_span / points) ** 2
+        root = np.asarray(np.linalg.cholesky(covariance))
     return ParameterDensity(_best_along_alias(model, end, alias, points), root)
 
 

@@ -278,10 +278,6 @@ def _with_judged_noise(
     return [with_residual_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
 
 
-WHOLE_TEST_ROUNDS = 2
-"""Rounds on the whole test from the optimum on its first part, 1: one for most recordings."""
-
-
 def add_last_part(
     experiments: Sequence[Experiment],
     first_part: FirstPart,
@@ -289,25 +285,26 @@ def add_last_part(
 ) -> Refinement:
     """Optimum on all of the tests from that on their first parts.
 
-    A round leads there, with oil and supply free, and where it steps by more than a deviation a
-    second one; where that does, too, all is refined. experiments: with the noise as the first part
-    shows it.
+    It is near (`rest_near`); where a break-away is within the width of a round two rounds lead
+    there, and where the second does not come to rest all is refined. experiments: with the noise as
+    the first part shows it.
     """
     first = first_part.refined
     ends = [item.ticks for item in experiments]
     levels = start_residuals(experiments, ends, first.values).levels
     whole = anchored_derivatives(experiments, levels=levels)
-    found = first
-    for _ in range(WHOLE_TEST_ROUNDS):
-        before = found
-        density = start_density(whole, before.values, near_spread(before))
-        found = last_round(whole, density, settled=True)
-        if found.converged:
-            break
-    else:
-        rest = refine_severities(whole, before.values, near_spread(before), between)
-        density = start_density(whole, rest.values, near_spread(rest))
-        found = last_round(whole, density, settled=rest.converged)
+    found = rest_near(whole, first.values, near_spread(first))
+    if found is None:
+        near = last_round(
+            whole, start_density(whole, first.values, near_spread(first)), settled=True
+        )
+        found = last_round(
+            whole, start_density(whole, near.values, near_spread(near)), settled=True
+        )
+        if not found.converged:
+            rest = refine_severities(whole, near.values, near_spread(near), between)
+            density = start_density(whole, rest.values, near_spread(rest))
+            found = last_round(whole, density, settled=rest.converged)
     return replace(found, evaluations=1 + found.evaluations)
 
 
