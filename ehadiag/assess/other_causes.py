@@ -24,6 +24,7 @@ from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.criteria import (
     ESTIMATION,
     FIT,
+    NOISE_LIMIT,
     NORMAL_HALF_WIDTH_95,
     RECORDING,
     RESPONSE,
@@ -384,7 +385,7 @@ def _frozen_since(measured: Array, model: Array, lsb: float, least: int) -> int 
     still = RESPONSE.max_still_lsb * lsb
     wide = np.maximum.accumulate(back) - np.minimum.accumulate(back) > still
     count = int(wide.argmax()) if wide.any() else len(back)
-    if count < least or float(np.ptp(model[seen[-count:]])) <= still:
+    if count < least or float(np.ptp(model[seen[-count:]])) <= NOISE_LIMIT * still:
         return None
     return int(seen[-count])
 

@@ -32,7 +32,7 @@ from ehadiag.core.criteria import (
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
-from ehadiag.model.batch import NO_ANCHOR
+from ehadiag.model.batch import NO_ANCHOR, PRESSURE_ROW
 from ehadiag.model.residual_models import ModelResponse, model_response
 
 
@@ -319,7 +319,10 @@ def objections_to_supply(
     for side in (1.0, -1.0):
         got, expected = side * measured[seen], side * modelled.pressure[seen]
         top = float(got.max())
-        margin = RESPONSE.min_pressure_excess_share * abs(top)
+        margin = max(
+            NOISE_LIMIT * experiment.noise[PRESSURE_ROW],
+            RESPONSE.min_pressure_excess_share * abs(top),
+        )
         # A peak that is only lower than the model's is none that is cut off.
         cut = (expected > top + margin) & (got > top - margin)
         if np.count_nonzero(cut) > 1:  # one tick's peak is a break-away's

@@ -258,11 +258,6 @@ def inlined(function: F) -> F:
     return _part(function, forceinline=True, fastmath={"contract"})
 
 
-def large_part(function: F) -> F:
-    """Compile like `inlined`, but as a function of its own, without a copy in each kernel."""
-    return _part(function, forceinline=False, fastmath={"contract"})
-
-
 def inlined_exact(function: F) -> F:
     """Compile like `inlined`, with each product and each sum rounded by itself."""
     return _part(function, forceinline=True)

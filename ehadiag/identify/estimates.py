@@ -144,7 +144,7 @@ def signal_excess_costs(residuals: Array) -> list[float]:
 
 def explains_far_more(excess: float, before: float) -> bool:
     """Whether an estimate leaves at most half of what another one leaves beside the noise."""
-    return excess - 1.0 < GIVE_UP.max_trial_share * (before - 1.0)
+    return before > 1.0 and excess - 1.0 < GIVE_UP.max_trial_share * (before - 1.0)
 
 
 def likelihood_ratio_cost(residuals: Array, others: Array) -> float:

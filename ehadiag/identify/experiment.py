@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels, conversion_of
-from ehadiag.core.criteria import ANCHORING, ESTIMATION
+from ehadiag.core.criteria import ANCHORING, ESTIMATION, RECORDING
 from ehadiag.identify.signals import (
     CurrentTrace,
     acquired_current,
@@ -406,14 +406,14 @@ def _ticks_under_pressure(pressure: Array, test: StoredTest, channel: Channel) -
 
 
 def _mean_of_motion(pressure: Array, test: StoredTest) -> float:
-    """Mean pressure over the windows of the genetic search, Pa; 0 before most of them is there."""
+    """Mean pressure over the windows of the genetic search, Pa; 0 before enough is there."""
     time = (np.arange(len(pressure)) + 1.0) / test.rate
     inside = np.zeros(len(pressure), dtype=np.bool_)
     for begin, end in test.windows.refinement:
         inside |= (begin < time) & (time <= end)
     seen = pressure[inside & np.isfinite(pressure)]
     needed = sum(end - begin for begin, end in test.windows.refinement) * test.rate
-    return float(seen.mean()) if seen.size > 0.5 * needed else 0.0
+    return float(seen.mean()) if seen.size >= RECORDING.min_sample_share * needed else 0.0
 
 
 def _slides(position: Array, channel: Channel) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT, Actuator
+from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT, MAX_NOISE_EXCESS, Actuator
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import FIT, LOSSES, NORMAL_HALF_WIDTH_95
 from ehadiag.identify import compact_ga
@@ -28,9 +28,9 @@ from ehadiag.identify.estimates import (
     friction_by_exponent,
     identification_result,
     independent_covariance,
-    is_noise,
     likelihood_ratio_cost,
     over_exponents,
+    refinement_outlier_share,
 )
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, share_offsets
 from ehadiag.identify.identification_result import Identification, IdentificationTiming
@@ -504,7 +504,10 @@ def _interim_estimate(refined: Refinement) -> InterimEstimate:
 def _severities_suffice(refinement: Refinement) -> bool:
     """Whether the severities alone explain a recording, without slow residuals, of which
     small nuisances would be the cause."""
-    return is_noise(refinement.residuals)
+    return (
+        refinement_outlier_share(refinement) <= FIT.max_outliers_of_noise
+        and excess_cost(refinement.residuals) <= MAX_NOISE_EXCESS
+    )
 
 
 def _nuisances_explain_no_more(freed: NuisanceEstimate, alone: SeverityAttempt) -> bool:

@@ -67,6 +67,8 @@ from ehadiag.model.severities import FAULT_LAWS
 
 HYSTERESIS_NAME = "hysteresis"
 AMBIGUOUS_STDS = {name: law.ambiguous_std for name, law in FAULT_LAWS.items()}
+VALLEY_SEVERITIES = ("Kintas", FRICTION_NAME)
+"""Severities along whose valleys the likelihood counts: that of `FDJ` changed nothing (ADR 23)."""
 PROFILE_HALF_WIDTH = RUN_BLOCK_SIZE - 1
 """Half width of the likelihood profile along a valley, deviations: two blocks of runs."""
 
@@ -180,8 +182,8 @@ def estimate_about(
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
     )
-    for name, law in FAULT_LAWS.items():
-        if law.needs_each_tick and name in refined.values:  # a calibration holds the severities
+    for name in VALLEY_SEVERITIES:
+        if name in refined.values:  # a calibration holds the severities
             covariance = covariance + _profile_covariance(fine, refined, name)
     refined = refined_with_day(fine, refined, linear)
     ambiguous = _is_hysteresis_small(refined, judged)

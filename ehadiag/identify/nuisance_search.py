@@ -83,8 +83,8 @@ class RestartRules(msgspec.Struct, frozen=True):
 RESTARTS = RestartRules()
 
 NUISANCE_RUN_BUDGET = 3200
-"""Runs of the model after which no further start is made, 1: of four starts in closed loop, which
-take some 200 to 700 each, and the looks about their ends."""
+"""Runs of the model after which no further start is made, 1, if `GIVE_UP` allows more: a start in
+closed loop takes some 200 to 700, and looks about its end as many."""
 
 
 class StartEnd(msgspec.Struct, frozen=True, eq=False):

@@ -13,7 +13,6 @@ from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator, Calibration
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.criteria import NUMERICAL_ZERO
 from ehadiag.identify.estimates import (
     ExplanationTest,
     calibrated_explanation_test,
@@ -173,6 +172,8 @@ DAILY_PRIORS = {
     item.name: ParameterPrior(0.0, item.day_std) for item in REGISTRY if item.day_std is not None
 }
 """Priors of what no calibration can keep."""
+ALIAS_DIFFERENCE_STEP = 1e-6
+"""Step of a derivative by a datum or a severity, 1: a double keeps ten digits of the difference."""
 CALIBRATED_SEVERITY_STD = 1e-4
 """Of a severity: what two optima on noise of their own, a calibration's and a diagnosis's, differ
 by beyond their covariances. Errors of calibrated random units were 1.3 to 2.7 times what these
@@ -201,8 +202,8 @@ class DatumAlias(msgspec.Struct, frozen=True):
         points = np.array(
             [
                 [0.0, severity],
-                [NUMERICAL_ZERO, severity],
-                [0.0, severity + NUMERICAL_ZERO],
+                [ALIAS_DIFFERENCE_STEP, severity],
+                [0.0, severity + ALIAS_DIFFERENCE_STEP],
             ]
         )
         there, datum, fault = unknowns.candidates(points)[:, 0]

@@ -54,8 +54,8 @@ def relative_noise(residuals: Array) -> float:
     """Noise that weighted residuals show, in units of the noise that weights them.
 
     Second differences contain the noise; what the model fails to explain moves slowly and stays
-    out, so that it still shows as a residual that the noise does not cover. residuals: 0 where no
-    sample counts, shape (n,).
+    out, so that it still shows as a residual that the noise does not cover. Residuals without noise
+    show what a double rounds. residuals: 0 where no sample counts, shape (n,).
     """
     present = residuals != 0.0
     second = residuals[2:] - 2.0 * residuals[1:-1] + residuals[:-2]
@@ -64,7 +64,8 @@ def relative_noise(residuals: Array) -> float:
     if not kept:
         return 1.0
     least = np.partition(np.abs(second), kept - 1)[:kept]
-    return float(np.mean(least) / (ESTIMATION.noise_kept_mean * np.sqrt(6.0)))
+    noise = float(np.mean(least) / (ESTIMATION.noise_kept_mean * np.sqrt(6.0)))
+    return max(noise, NUMERICAL_ZERO)
 
 
 COMMAND_RESOLUTIONS = np.sort(

@@ -311,7 +311,7 @@ class Clock:
     ("nuisances", "limit", "stage"),
     [
         (NuisanceMode.AUTO, 0.05, "search"),
-        (NuisanceMode.AUTO, 0.18, "refinement"),
+        (NuisanceMode.AUTO, 0.165, "refinement"),
         (NuisanceMode.ALL, 0.27, "nuisances"),
         (NuisanceMode.ALL, 0.3, "nuisances"),
     ],

@@ -1,6 +1,6 @@
 """An identification that is fed while the test runs: the answer of the recording alone, sooner.
 
-The last part of a test, added to the optimum of the rest.
+The optimum on the whole test, from that on its first part.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def of_severities(found, values):
 
 
 def deviations(experiments):
-    """Distance of the last step's optimum, and of the first part's, from that of one descent."""
+    """Distance of the optimum from the first part's, and of that, from that of one descent."""
     _, first, judged = parts(experiments)
     whole = refine_severities(anchored_derivatives(judged), named(FAULTS))
     std = of_severities(whole, np.sqrt(np.diag(estimate_covariance(whole))))

@@ -227,7 +227,7 @@ def test_a_jack_against_its_stop_stays_and_comes_back():
     assert (struck.place, struck.velocity, struck.direction) == (LAW.stroke, 0.0, 0.0)
 
 
-def test_friction_holds_a_resting_Jack():
+def test_friction_holds_a_resting_jack():
     """Up to its static friction: over the middle nothing moves, and nothing is kept in mind."""
     rest = Jack(1e-3, 0.0, 0.0, 1.0)
     small = 0.9 * LAW.static / (CONSTANTS.AJ * CONSTANTS.GP)
