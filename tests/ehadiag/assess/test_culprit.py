@@ -37,7 +37,7 @@ def diagnosed(effects=None, sensors=None, change=None):
 @pytest.mark.parametrize(
     ("effects", "sensors", "name", "advice"),
     [
-        (Effects(load=500.0), None, "load", "load looks +5e+02 N"),
+        (Effects(load=1500.0), None, "load", "load looks +1.5e+03 N"),
         (
             Effects(oil_temperature=25.0),
             Sensors(temperature_error=15.0),
