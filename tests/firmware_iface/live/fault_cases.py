@@ -179,7 +179,6 @@ CASES = (
         lambda _: [bf.loss_bursts(200, 400.0)],
         least=0.4,
         counts=LOST,
-        unfit="samples are missing",
     ),
     Case("frames twice, 10 %", lambda _: [DuplicateFrames(0.1)], counts=("repeated",)),
     Case("all frames twice", lambda _: [DuplicateFrames(1.0)], counts=("repeated",)),
