@@ -228,11 +228,12 @@ def _profile_covariance(model: Derivatives, refined: Refinement, name: str) -> A
     costs = cauchy_cost(model.many(points[kept])) / unit
     weights = np.exp(-0.5 * (costs - costs.min()))
     extra = max(float(weights @ shifts**2 / weights.sum()) - 1.0, 0.0)
+    out = extra * np.outer(along, along) * np.outer(refined.scale, refined.scale)
     beside = np.abs(np.diff(costs))[np.abs(shifts[1:] - 0.5) <= 1.0]
     if beside.max(initial=0.0) > BREAK_AWAYS.event_cost:
         # Where the floor ends a break-away comes at another tick: what the model errs decides that.
-        extra += (AMBIGUOUS_STDS[name] / (along[place] * refined.scale[place])) ** 2
-    return np.asarray(extra * np.outer(along, along) * np.outer(refined.scale, refined.scale))
+        out[place, place] += AMBIGUOUS_STDS[name] ** 2
+    return np.asarray(out)
 
 
 def _is_hysteresis_small(refined: Refinement, experiments: Sequence[Experiment]) -> bool:
