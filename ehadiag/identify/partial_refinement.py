@@ -215,32 +215,16 @@ def anchored_derivatives(
     spans: WindowSpans | None = None,
     levels: NDArray[np.int64] | None = None,
 ) -> Derivatives:
-    """Spans of the tests, re-anchored on the spool, in coordinates scaled by the noise."""
-    return anchored_model_derivatives(
-        anchored_model(experiments, spans, levels=levels), experiments
-    )
+    """Spans of the tests, re-anchored on the spool, in coordinates scaled by the noise.
 
-
-def anchored_model_derivatives(model: SimdModel, experiments: Sequence[Experiment]) -> Derivatives:
-    """A model of `anchored_model`, in coordinates scaled by the noise."""
-    return Derivatives(model, experiments[0].noise, considered_parameters(experiments))
-
-
-def anchored_model(
-    experiments: Sequence[Experiment],
-    spans: WindowSpans | None = None,
-    *,
-    lead: float = 0.0,
-    levels: NDArray[np.int64] | None = None,
-) -> SimdModel:
-    """Model of spans of the tests, re-anchored on the spool.
-
-    `levels`: of a model of the same spans, if there was one.
+    levels: of a model of the same spans, if there was one.
     """
-    batch = lay_out_spans(experiments, spans, lead=lead, anchor_lsb=ANCHOR_THRESHOLDS_LSB)
-    considered = [item.parameter for item in considered_parameters(experiments)]
-    unknowns = unknowns_of(experiments, (*FAULTS, *SENSOR_OFFSETS, *considered))
-    return SimdModel(batch, unknowns, levels=levels)
+    batch = lay_out_spans(experiments, spans, anchor_lsb=ANCHOR_THRESHOLDS_LSB)
+    considered = considered_parameters(experiments)
+    held = [item.parameter for item in considered]
+    unknowns = unknowns_of(experiments, (*FAULTS, *SENSOR_OFFSETS, *held))
+    model = SimdModel(batch, unknowns, levels=levels)
+    return Derivatives(model, experiments[0].noise, considered)
 
 
 def considered_parameters(
@@ -293,18 +277,19 @@ def add_last_part(
     ends = [item.ticks for item in experiments]
     levels = start_residuals(experiments, ends, first.values).levels
     whole = anchored_derivatives(experiments, levels=levels)
+
+    def round_about(end: Refinement, *, settled: bool = True) -> Refinement:
+        return last_round(
+            whole, start_density(whole, end.values, near_spread(end)), settled=settled
+        )
+
     found = rest_near(whole, first.values, near_spread(first))
     if found is None:
-        near = last_round(
-            whole, start_density(whole, first.values, near_spread(first)), settled=True
-        )
-        found = last_round(
-            whole, start_density(whole, near.values, near_spread(near)), settled=True
-        )
+        near = round_about(first)
+        found = round_about(near)
         if not found.converged:
             rest = refine_severities(whole, near.values, near_spread(near), between)
-            density = start_density(whole, rest.values, near_spread(rest))
-            found = last_round(whole, density, settled=rest.converged)
+            found = round_about(rest, settled=rest.converged)
     return replace(found, evaluations=1 + found.evaluations)
 
 

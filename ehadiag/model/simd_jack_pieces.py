@@ -167,14 +167,14 @@ def _orifice_events(senses: bool) -> Any:
 
     @large_packed
     def events(
-        o: int, these: Vector, span: Vector, x0: Vector, x1: Vector, rise0: Vector, rise1: Vector,
-        due: Vector, begin: float, stop: float, state: Array, coefficients: Array,
+        o: int, these: Vector, piece: PathPiece, due: Vector, begin: float, stop: float,
+        state: Array, coefficients: Array,
     ) -> None:  # fmt: skip
         j, mine = jack_laws(coefficients, o), these != 0.0
         place, velocity, d, _ = jacks(state, o)
         p12, zero = load(state, ROWS.pressure * LANES + o), d * 0.0
         one, creeps = zero + 1.0, any_lane(j.extra > 0.0)
-        span = where(mine, span, 1.0)
+        span = where(mine, piece.span, 1.0)
         follows = False
         if senses:
             sensor = sensor_laws(coefficients, o)
@@ -183,7 +183,7 @@ def _orifice_events(senses: bool) -> Any:
                 load(state, ROWS.pressure_lagged * LANES + o),
                 load(state, ROWS.pressure_sampled * LANES + o),
             )
-        piece = PathPiece(span, x0, x1, rise0, rise1)
+        piece = PathPiece(span, piece.x0, piece.x1, piece.rise0, piece.rise1)
         ring = lane_sqrt(maximum(oil_at(j, place), ORIFICE_STEPS.least_share) * j.area * j.by_mass)
         usual = minimum(ORIFICE_STEPS.ringing / ring, ORIFICE_STEPS.longest_s) * (1.0 + 1e-9)
         growth = maximum(j.extra * j.by_stribeck * j.by_mass, 1.0)
@@ -371,15 +371,16 @@ def _linear_events(senses: bool) -> Any:
 
     @large_packed
     def events(
-        o: int, these: Vector, span: Vector, x0: Vector, x1: Vector, rise0: Vector, rise1: Vector,
-        due: Vector, begin: float, stop: float, state: Array, coefficients: Array,
+        o: int, these: Vector, piece: PathPiece, due: Vector, begin: float, stop: float,
+        state: Array, coefficients: Array,
     ) -> None:  # fmt: skip
         j, goes = jack_laws(coefficients, o), these != 0.0
         mine, creeps = goes, senses and any_lane(j.extra > 0.0)
         place, velocity, d, fresh = jacks(state, o)
         zero = d * 0.0
         one, q = zero + 1.0, zero + begin
-        piece = PathPiece(where(mine, span, 1.0), x0, x1, rise0, rise1)
+        x0, x1 = piece.x0, piece.x1
+        piece = PathPiece(where(mine, piece.span, 1.0), x0, x1, piece.rise0, piece.rise1)
         spring, x = j.spring * place, position_on_piece(piece, zero + stop)
         up, down = excess_force(j, x, spring + j.static), excess_force(j, x, spring - j.static)
         rests = goes & (d == 0.0) & (up <= 0.0) & (down >= 0.0)
@@ -467,7 +468,7 @@ linear_events, sensed_linear_events = _linear_events(False), _linear_events(True
 """Compiled: jacks of a linear second stage over the shares begin … stop of a piece of the spool's
 path, with stops and starts, of the lanes from `o` in which `these` is not 0; the second one with
 Stribeck's friction and their pressure as the filter has it. due: from the start of the piece to the
-instant of sampling, s; the other numbers are those of a `PathPiece`."""
+instant of sampling, s."""
 
 
 def _step_events(events: Any) -> Any:
@@ -485,10 +486,13 @@ def _step_events(events: Any) -> Any:
         for n in range(int(begin), math.ceil(stop)):
             a = n * LANES + o
             slope = LANE_PATH_SLOPE * LANES + a
+            piece = PathPiece(
+                lead * 0.0 + span, load(path, a), load(path, a + LANES),
+                span * load(path, slope), span * load(path, slope + LANES),
+            )  # fmt: skip
             events(
-                o, where(these, 1.0, 0.0), lead * 0.0 + span, load(path, a),
-                load(path, a + LANES), span * load(path, slope), span * load(path, slope + LANES),
-                due - n * span, max(begin - n, 0.0), min(stop - n, 1.0), state, coefficients,
+                o, where(these, 1.0, 0.0), piece, due - n * span,
+                max(begin - n, 0.0), min(stop - n, 1.0), state, coefficients,
             )  # fmt: skip
 
     return step_events
@@ -535,30 +539,17 @@ def jack_over_pieces(
         piece = PathPiece(span, x0, x1, rise0, rise1)
         if shaped:
             piece = land_opening_piece(j, piece)
-        by_orifice, by_line = orifice & (span > 0.0), linear & (span > 0.0)
-        if any_lane(by_orifice):
-            flags = where(by_orifice, 1.0, 0.0)
+        flags = where(orifice & (span > 0.0), 1.0, 0.0)
+        if any_lane(flags != 0.0):
             if senses:
-                sensed_orifice_events(
-                    o, flags, span, piece.x0, piece.x1, piece.rise0, piece.rise1, due, 0.0, 1.0,
-                    state, coefficients,
-                )  # fmt: skip
+                sensed_orifice_events(o, flags, piece, due, 0.0, 1.0, state, coefficients)
             else:
-                orifice_events(
-                    o, flags, span, piece.x0, piece.x1, piece.rise0, piece.rise1, due, 0.0, 1.0,
-                    state, coefficients,
-                )  # fmt: skip
-        if any_lane(by_line):
-            flags = where(by_line, 1.0, 0.0)
+                orifice_events(o, flags, piece, due, 0.0, 1.0, state, coefficients)
+        flags = where(linear & (span > 0.0), 1.0, 0.0)
+        if any_lane(flags != 0.0):
             if senses:
-                sensed_linear_events(
-                    o, flags, span, piece.x0, piece.x1, piece.rise0, piece.rise1, due, 0.0, 1.0,
-                    state, coefficients,
-                )  # fmt: skip
+                sensed_linear_events(o, flags, piece, due, 0.0, 1.0, state, coefficients)
             else:
-                linear_events(
-                    o, flags, span, piece.x0, piece.x1, piece.rise0, piece.rise1, due, 0.0, 1.0,
-                    state, coefficients,
-                )  # fmt: skip
+                linear_events(o, flags, piece, due, 0.0, 1.0, state, coefficients)
         x0, due = where(span > 0.0, x1, x0), due - span
     store(state, ROWS.done * LANES + o, where(mine, 1.0, load(state, ROWS.done * LANES + o)))

@@ -126,8 +126,8 @@ def over(piece, begin, stop, state, law=LAW, *, events=linear_events, sensor=Non
     lanes = np.ones(VECTOR_WIDTH)
     with np.errstate(all="ignore"):  # as in the kernel, where both sides of a choice are made
         events(
-            0, lanes, *(lanes * item for item in piece), lanes * due, begin, stop, numbers,
-            coefficients,
+            0, lanes, PathPiece(*(lanes * item for item in piece)), lanes * due, begin, stop,
+            numbers, coefficients,
         )  # fmt: skip
     return Jack(*(float(numbers[row * LANES]) for row in JACK_ROWS))
 
