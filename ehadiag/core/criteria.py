@@ -201,9 +201,9 @@ class BreakAwayRules(msgspec.Struct, frozen=True):
 
     block: int = 25
     """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
-    event_cost: float = 30.0
+    event_cost: float = 40.0
     """Least cost of a block, beyond the usual one, with such a break-away: noise alone makes that
-    of one block in 2000, so in a tenth of the recordings, whose intervals are wider then."""
+    of one block in 100 000, so in one of 500 recordings."""
     max_end_cost: float = 2.0
     """Cost of an end of a search, noise included, over the best one's, 1, up to which it differs by
     break-aways: of a unit with 0.08 % of hysteresis four of five ends cost 1.2 to 1.4 times as

@@ -178,6 +178,9 @@ def estimate_about(
                 if settings.explains(residuals) and not _has_event(residuals, creeps):
                     break
             judged = items
+            if _has_event(residuals, fine.model.batch.weight > 0.0):
+                wide = replace(density, root=RESTARTS.event_spread * density.root)
+                density = search(fine, begin=wide).density
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
@@ -307,13 +310,23 @@ def _ends_covariance(found: MultistartResult, scale: Array) -> Array:
 
 def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEstimate:
     """The further estimate if it explains more of the recordings, with the effort of both."""
-    more = further.explained or (not found.explained and further.excess < found.excess)
-    best = further if more else found
+    best = max(further, found, key=lambda item: (item.explained, -item.excess))
     return replace(
         best,
         evaluations=found.evaluations + further.evaluations,
         starts=found.starts + further.starts,
     )
+
+
+def _may_stick_elsewhere(found: NuisanceEstimate) -> bool:
+    """Whether a model that follows the spool's sensor before the motion may explain more.
+
+    Running free it may stick elsewhere; other friction then explains the rest but for a break-away.
+    """
+    left = found.refined.residuals
+    if found.explained:
+        return _has_event(left, found.refined.weighted)
+    return not _leaves_too_much(left)
 
 
 def _leaves_too_much(residuals: Array) -> bool:
@@ -345,7 +358,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
         found = self._with(experiments, self.prior, hint, budget=budget)
-        if any(creeps) and not (found.explained or _leaves_too_much(found.refined.residuals)):
+        if any(creeps) and _may_stick_elsewhere(found):
             followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
