@@ -32,6 +32,7 @@ NAMES = [f"eha_{model}_fmi{n}" for model in ("actuator", "monitor") for n in (2,
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.xdist_group("FMUs"),
     pytest.mark.skipif(sys.platform != "linux", reason="units are written for Linux"),
     pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here"),
 ]

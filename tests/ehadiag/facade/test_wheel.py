@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from places import LOGS, ROOT
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]
 
 CLIENT = Path(__file__).with_name("typed_client.py")
 

@@ -65,6 +65,7 @@ def kernels(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.xdist_group("widths")
 @pytest.mark.parametrize("kind", ["linear", "orifice"])
 @pytest.mark.parametrize("effects", EFFECTS.values(), ids=EFFECTS)
 def test_each_width_has_the_same_bits(kernels, effects, kind):
