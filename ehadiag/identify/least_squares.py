@@ -31,6 +31,7 @@ from ehadiag.identify.posterior import (
     no_interruption,
     search_posterior,
 )
+from ehadiag.identify.signals import median_of
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import ResidualModel
 from ehadiag.model.severities import SEARCH_STDS
@@ -199,7 +200,7 @@ def median_offsets(model: ResidualModel, residuals: Array) -> dict[str, float]:
             weight = model.batch.weight[item.adds_to]
             used = weight > 0.0
             shares = residuals[item.adds_to][used] / weight[used]
-            out[item.name] = float(np.median(shares)) if used.any() else 0.0
+            out[item.name] = float(median_of(shares)) if used.any() else 0.0
     return out
 
 
