@@ -344,7 +344,7 @@ def hash_of_samples(recording: Recording) -> str | None:
         # One zero, one NaN: equal numbers have equal bits.
         plain = np.asarray(values + 0.0, dtype="<f8")
         plain[np.isnan(plain)] = np.nan
-        out.update(plain)
+        out.update(plain.data)
     return out.hexdigest()
 
 

@@ -382,7 +382,7 @@ def refinement_outlier_share(refined: Refinement) -> float:
 
 def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) -> float:
     """Rms residual of a signal, squares capped; NaN without a sample."""
-    residuals = refined.residuals[row, refined.weighted[row]]
+    residuals = refined.residuals[row][refined.weighted[row]]
     return float(np.sqrt(np.mean(np.minimum(residuals**2, cap)))) if residuals.size else np.nan
 
 
