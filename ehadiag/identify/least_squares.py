@@ -84,7 +84,16 @@ class Refinement(msgspec.Struct, frozen=True, eq=False):
     def normal(self) -> Array:
         """JᵀJ of the rows that took part, in units of `scale`, shape (k, k)."""
         rows = self.jacobian.reshape(len(self.jacobian), -1)  # 0 where none took part
-        return np.asarray(rows @ rows.T)
+        return products(rows)
+
+
+def products(rows: Array) -> Array:
+    """Products of few long rows with each other, shape (k, k) for rows of shape (k, n).
+
+    Of a matrix and itself numpy asks another function of BLAS, which takes four times as long for
+    rows of this kind: hence the copy.
+    """
+    return np.asarray(rows @ rows.copy().T)
 
 
 def refine_severities(
