@@ -342,8 +342,9 @@ def hash_of_samples(recording: Recording) -> str | None:
     measured = samples.current, samples.spool, samples.pressure, samples.position
     for values in (samples.command, *measured):
         # One zero, one NaN: equal numbers have equal bits.
-        plain = np.where(np.isnan(values), np.nan, values + 0.0)
-        out.update(plain.astype("<f8").tobytes())
+        plain = np.asarray(values + 0.0, dtype="<f8")
+        plain[np.isnan(plain)] = np.nan
+        out.update(plain.data)
     return out.hexdigest()
 
 

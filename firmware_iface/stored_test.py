@@ -7,7 +7,7 @@ each stage of the diagnosis uses. A rig's computer may store others: a test is a
 from __future__ import annotations
 
 import itertools
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -191,14 +191,18 @@ def encode_test(test: StoredTest) -> bytes:
 
 def bundled_tests() -> dict[str, StoredTest]:
     """Return the stored tests that come with the package (PHY-25, PHY-26), by name."""
-    folder = Path(__file__).parent / "data/tests"
-    tests = {}
-    for entry in sorted(folder.iterdir()):
+    return {test.name: test for test in _bundled_tests()}
+
+
+@cache
+def _bundled_tests() -> tuple[StoredTest, ...]:
+    """Stored tests that come with the package, read once."""
+    tests = []
+    for entry in sorted((Path(__file__).parent / "data/tests").iterdir()):
         if entry.name.endswith(".toml"):
             where = f"bundled test {entry.name}"
-            test = _checked(decode_toml(entry.read_bytes(), StoredTest, where), where)
-            tests[test.name] = test
-    return tests
+            tests.append(_checked(decode_toml(entry.read_bytes(), StoredTest, where), where))
+    return tuple(tests)
 
 
 def resolve_test(name: str) -> StoredTest:

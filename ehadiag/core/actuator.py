@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -350,6 +351,7 @@ def load_actuator(path: Path | str) -> Actuator:
     return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
 
 
+@cache
 def default_actuator() -> Actuator:
     """Return the reference actuator, which comes with the package."""
     text = Path(__file__).parents[1].joinpath("data/actuator.toml").read_bytes()

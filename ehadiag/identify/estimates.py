@@ -26,7 +26,7 @@ from ehadiag.identify.identification_result import (
     IdentificationTiming,
     Nuisance,
 )
-from ehadiag.identify.least_squares import Refinement
+from ehadiag.identify.least_squares import Refinement, products
 from ehadiag.identify.signals import relative_noise
 from ehadiag.identify.solvers import SearchResult
 from ehadiag.identify.staged_search import FirstApproximation
@@ -63,7 +63,7 @@ def estimate_covariance(refinement: Refinement) -> Array:
     rows = slopes.reshape(len(slopes), -1)
     prior = np.eye(len(slopes))
     prior[:count, :count] = information
-    inverse = np.linalg.pinv(rows @ rows.T + prior, hermitian=True)
+    inverse = np.linalg.pinv(products(rows) + prior, hermitian=True)
     squares = float((refinement.residuals[used] ** 2).sum())
     reduced = squares / max(int(used.sum()) - count, 1)
     curved = inverse * max(reduced / ESTIMATION.capped_variance, 1.0)
@@ -93,7 +93,7 @@ def _meat(slopes: Array, residuals: Array) -> Array:
     score = np.einsum("ksn,sn->kn", slopes, residuals)
     total = np.pad(score.cumsum(axis=1), ((0, 0), (0, count - 1)), mode="edge")
     total[:, count:] -= total[:, :-count].copy()
-    return np.asarray(total @ total.T / count)
+    return products(total) / count
 
 
 def independent_covariance(parameters: Sequence[Parameter], std: Mapping[str, float]) -> Array:
@@ -382,7 +382,7 @@ def refinement_outlier_share(refined: Refinement) -> float:
 
 def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) -> float:
     """Rms residual of a signal, squares capped; NaN without a sample."""
-    residuals = refined.residuals[row, refined.weighted[row]]
+    residuals = refined.residuals[row][refined.weighted[row]]
     return float(np.sqrt(np.mean(np.minimum(residuals**2, cap)))) if residuals.size else np.nan
 
 

@@ -31,6 +31,7 @@ from ehadiag.identify.posterior import (
     no_interruption,
     search_posterior,
 )
+from ehadiag.identify.signals import median_of
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import ResidualModel
 from ehadiag.model.severities import SEARCH_STDS
@@ -83,7 +84,16 @@ class Refinement(msgspec.Struct, frozen=True, eq=False):
     def normal(self) -> Array:
         """JᵀJ of the rows that took part, in units of `scale`, shape (k, k)."""
         rows = self.jacobian.reshape(len(self.jacobian), -1)  # 0 where none took part
-        return np.asarray(rows @ rows.T)
+        return products(rows)
+
+
+def products(rows: Array) -> Array:
+    """Products of few long rows with each other, shape (k, k) for rows of shape (k, n).
+
+    Of a matrix and itself numpy asks another function of BLAS, which takes four times as long for
+    rows of this kind: hence the copy.
+    """
+    return np.asarray(rows @ rows.copy().T)
 
 
 def refine_severities(
@@ -127,8 +137,7 @@ def refinement_by_lines(
     shift[linear.scatter >= ESTIMATION.max_row_scatter] = 0.0
     residuals = linear.middle + shift
     # The last round counts re-anchorings and considered parameters.
-    considered = np.zeros((0, *residuals.shape))
-    return _refinement(model, x, linear, residuals, considered, anchored=0, settled=settled)
+    return _refinement(model, x, linear, residuals, anchored=0, settled=settled)
 
 
 def refinement_at(
@@ -140,10 +149,11 @@ def refinement_at(
     information: Array | None = None,
 ) -> Refinement:
     """Evaluate an optimum; linear: the model about it, over the width of its density."""
-    (residuals,), considered, anchored = model.at(x)
-    held, daily = considered[~model.daily], considered[model.daily]
-    found = _refinement(model, x, linear, residuals, held, anchored=anchored, settled=settled)
-    return _without_jumps(replace(found, information=information, daily=daily), linear)
+    (residuals,), daily, anchored = model.at(x)
+    found = _refinement(model, x, linear, residuals, anchored=anchored, settled=settled)
+    held = model.held_effects(residuals)
+    found = replace(found, considered=held, information=information, daily=daily)
+    return _without_jumps(found, linear)
 
 
 def _refinement(
@@ -151,7 +161,6 @@ def _refinement(
     x: Array,
     linear: LinearModel,
     residuals: Array,
-    considered: Array,
     *,
     anchored: int,
     settled: bool,
@@ -170,7 +179,7 @@ def _refinement(
         cost=capped_cost(residuals),
         residuals=residuals,
         jacobian=np.where(used, linear.jacobian, 0.0),
-        considered=considered,
+        considered=np.zeros((0, *residuals.shape)),
         used=used,
         weighted=weighted,
         evaluations=model.evaluations,
@@ -199,8 +208,8 @@ def median_offsets(model: ResidualModel, residuals: Array) -> dict[str, float]:
         if item.adds_to is not None and item.adds_to < len(model.batch.weight):
             weight = model.batch.weight[item.adds_to]
             used = weight > 0.0
-            shares = residuals[item.adds_to, used] / weight[used]
-            out[item.name] = float(np.median(shares)) if used.any() else 0.0
+            shares = residuals[item.adds_to][used] / weight[used]
+            out[item.name] = float(median_of(shares)) if used.any() else 0.0
     return out
 
 
@@ -216,11 +225,11 @@ def last_round(model: Derivatives, density: ParameterDensity, *, settled: bool) 
     its own step, but for what oil and supply add, is at most a deviation.
     """
     cross = CoordinateCross.about(model, density)
-    runs, considered, anchored = model.at(*cross.points)
+    runs, daily, anchored = model.at(*cross.points)
     linear = cross.lines(model, runs)
-    found = refined_by_step(model, linear, considered, anchored, settled=settled)
-    found = _without_jumps(found, linear)
-    step = _last_round_step(model, linear, considered[:0])[0] - linear.at
+    found = refined_by_step(model, linear, daily, anchored, settled=settled)
+    found = _without_jumps(replace(found, considered=model.held_effects(runs[0])), linear)
+    step = _last_round_step(model, linear, daily[:0])[0] - linear.at
     most = near_spread(found) / FEW_UNKNOWNS_SCHEDULE.width
     rests = bool(np.all(np.abs(step * found.scale)[model.curved] <= most))
     return replace(found, step=step, converged=settled and rests)
@@ -229,25 +238,19 @@ def last_round(model: Derivatives, density: ParameterDensity, *, settled: bool) 
 def refined_by_step(
     model: Derivatives,
     linear: LinearModel,
-    considered: Array,
+    daily: Array,
     anchored: int,
     *,
     settled: bool = True,
 ) -> Refinement:
     """Step by the lines, with oil and supply free: the residuals are moved by both.
 
-    considered, anchored: of `Derivatives.at`.
+    daily, anchored: of `Derivatives.at`.
     """
-    daily = considered[model.daily]
     x, shift = _last_round_step(model, linear, daily, weighings=LAST_ROUND_WEIGHINGS)
     moved = replace(linear, residuals=linear.residuals + shift, middle=linear.middle + shift)
     found = refinement_by_lines(model, x, moved, settled=settled)
-    return replace(
-        found,
-        considered=considered[~model.daily],
-        daily=daily,
-        anchored=anchored,
-    )
+    return replace(found, daily=daily, anchored=anchored)
 
 
 class NearRules(NamedTuple):
@@ -281,11 +284,11 @@ def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> 
     for turn in range(NEAR.max_rounds):
         density = start_density(model, start, spread)
         cross = CoordinateCross.about(model, density)
-        runs, considered, anchored = model.at(*cross.points, days=slice(turn, turn + 1))
-        considered[model.daily] += effects
-        effects = considered[model.daily]
+        runs, daily, anchored = model.at(*cross.points, days=slice(turn, turn + 1))
+        daily += effects
+        effects = daily
         linear = cross.lines(model, runs)
-        found = refined_by_step(model, linear, considered, anchored)
+        found = refined_by_step(model, linear, daily, anchored)
         jumps = found.weighted & (linear.scatter > NEAR.min_jump_scatter)
         if np.count_nonzero(jumps) > NEAR.max_jumped_rows:
             return None
@@ -293,6 +296,7 @@ def rest_near(model: Derivatives, start: Mapping[str, float], spread: Array) -> 
         start, spread = found.values, near_spread(found)
         most = NEAR.max_step / FEW_UNKNOWNS_SCHEDULE.width * spread
         if turn > 0 and np.all(step <= most):
+            found = replace(found, considered=model.held_effects(runs[0]))
             return _without_jumps(found, linear)
     return None
 

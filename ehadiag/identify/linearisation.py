@@ -58,7 +58,7 @@ class ConsideredParameter(msgspec.Struct, frozen=True):
     std: float
     """Standard deviation of what is not known of it, in its unit."""
     rows: tuple[int, ...] | None = None
-    """Signals on which it counts; all unless given."""
+    """Signals on which an instant counts; all unless given."""
     by_rate: bool = False
     """Whether it is an instant of sampling (s before the end of a tick), too short for the signals
     to bend: what it does is worked out from how fast they change, without a run of the model."""
@@ -124,43 +124,48 @@ class Derivatives:
         return self.model.residuals(self.values(points))[0]
 
     def at(self, x: Array, *others: Array, days: slice = slice(None)) -> tuple[Array, Array, int]:
-        """Residuals at points; effect of considered parameters and re-anchorings at the first.
+        """Residuals at points; effect of oil and supply of the day and re-anchorings at the first.
 
-        Shapes (1 + n, signals, N), (c, signals, N) by a standard deviation of each considered
-        parameter, and scalar; all run in the same blocks. days: which of `daily` are run, the
-        effect of the others is 0.
+        Shapes (1 + n, signals, N), (d, signals, N) by a standard deviation of each, and scalar; all
+        run in the same blocks. days: which of `daily` are run, the effect of the others is 0.
         """
-        by_runs = np.flatnonzero(self.daily)[days].tolist()
+        daily = np.flatnonzero(self.daily)
+        by_runs = daily[days].tolist()
         count = 1 + len(others)
         points = self.values(np.vstack([x, *others, *[x] * len(by_runs)]))
         for row, j in enumerate(by_runs, count):
             points[row, len(x) + j] = DIFFERENCES.considered_step * self.considered[j].std
         runs, anchored = self.model.residuals(points)
-        step = DIFFERENCES.considered_step
-        considered = np.zeros((len(self.considered), *runs.shape[1:]))
-        considered[by_runs] = runs[count:] - runs[0]
-        for change, item in zip(considered, self.considered, strict=True):
-            if item.by_rate:
-                change[:] = step * item.std * self._rates(runs[0])
-            if item.rows is not None:
-                change[[row for row in range(len(change)) if row not in item.rows]] = 0.0
-        considered[np.abs(considered) >= DIFFERENCES.max_kink] = 0.0
-        considered /= step
-        return runs[:count], considered, int(anchored[0])
+        effects = np.zeros((len(daily), *runs.shape[1:]))
+        effects[days] = runs[count:] - runs[0]
+        return runs[:count], _without_kinks(effects), int(anchored[0])
 
-    def _rates(self, residuals: Array) -> Array:
-        """How fast the modelled signals change, weighted, from their residuals; 1/s.
+    def held_effects(self, residuals: Array) -> Array:
+        """Effect of the considered parameters that are held, where the residuals are these.
 
-        By the neighbours of each sample; 0 where one of them is missing.
+        By a standard deviation of each, shape (h, signals, N): without a run of the model.
+        """
+        held = [item for item in self.considered if item.by_rate]
+        effects = np.zeros((len(held), *residuals.shape))
+        for change, item in zip(effects, held, strict=True):
+            for row in range(len(change)) if item.rows is None else item.rows:
+                rates = self._rates(row, residuals[row])
+                change[row] = DIFFERENCES.considered_step * item.std * rates
+        return _without_kinks(effects)
+
+    def _rates(self, row: int, residuals: Array) -> Array:
+        """How fast a modelled signal changes, weighted, from its residuals; 1/s, shape (N,).
+
+        row: of the signal. By the neighbours of each sample; 0 where one of them is missing.
         """
         batch, out = self.model.batch, np.zeros(residuals.shape)
-        measured = batch.spool, batch.pressure, batch.position
-        for rate, values, row, weight in zip(out, measured, residuals, batch.weight, strict=False):
-            counts = weight > 0.0
-            share = np.divide(row, weight, out=np.full(row.shape, np.nan), where=counts)
-            modelled = values - share
-            for a, b, tick in zip(batch.start[:-1], batch.start[1:], batch.tick, strict=True):
-                rate[a:b] = np.gradient(modelled[a:b], tick) * weight[a:b]
+        measured, weight = (batch.spool, batch.pressure, batch.position)[row], batch.weight[row]
+        share = np.divide(
+            residuals, weight, out=np.full(residuals.shape, np.nan), where=weight > 0.0
+        )
+        modelled = measured - share
+        for a, b, tick in zip(batch.start[:-1], batch.start[1:], batch.tick, strict=True):
+            out[a:b] = np.gradient(modelled[a:b], tick) * weight[a:b]
         return np.nan_to_num(out, copy=False)
 
     def slopes(self, centres: Sequence[Array]) -> list[ResidualSlope]:
@@ -247,6 +252,16 @@ class Derivatives:
                 if item.adds_to < len(weight):
                     out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
         return out
+
+
+def _without_kinks(effects: Array) -> Array:
+    """Effects of considered parameters by a deviation each, 0 where a break-away makes a kink.
+
+    effects: by a step of each, overwritten; shape (c, signals, N).
+    """
+    effects[np.abs(effects) >= DIFFERENCES.max_kink] = 0.0
+    effects /= DIFFERENCES.considered_step
+    return effects
 
 
 def search_scale(item: Parameter, noise: Sequence[float]) -> float:

@@ -263,9 +263,9 @@ def _search_about(
 
     root: of the covariance over which it searches.
     """
-    seen = search(fine, begin=ParameterDensity(there.x, root)).density
-    costs = cauchy_cost(fine.many(np.vstack([there.x, seen.x])))
-    return seen if costs[0] > costs[1] else there
+    end = search(fine, begin=ParameterDensity(there.x, root))
+    better = cauchy_cost(end.first) > cauchy_cost(end.residuals)
+    return end.density if better else there
 
 
 def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:

@@ -51,6 +51,7 @@ from ehadiag.identify.prior import (
     prior_information,
     small_effects_density,
 )
+from ehadiag.identify.signals import median_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.residual_models import SimdModel
@@ -252,7 +253,7 @@ def _take_off_offsets(model: Derivatives, points: Array, runs: Array) -> None:
         if item.adds_to is not None and item.adds_to < slopes.shape[1]:
             slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
             used = slope != 0.0
-            offsets = np.median(run[:, used] / slope[used], axis=1)
+            offsets = median_of(run[:, used] / slope[used])
             points[:, k] -= offsets
             run -= offsets[:, None] * slope
 

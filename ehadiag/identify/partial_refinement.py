@@ -53,6 +53,7 @@ from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
 from ehadiag.model.simd_layout import MAX_JACK_HALVINGS
+from ehadiag.model.simd_residuals import jack_levels
 
 CONSIDERED_PARAMETERS = (
     ConsideredParameter(
@@ -274,8 +275,11 @@ def add_last_part(
     the first part shows it.
     """
     first = first_part.refined
-    ends = [item.ticks for item in experiments]
-    levels = start_residuals(experiments, ends, first.values).levels
+    spans = first_part_spans(experiments, [item.ticks for item in experiments])
+    free = lay_out_spans(experiments, spans)
+    point = np.array([[first.values[item.name] for item in FAULTS]])
+    paths = jack_levels(free, unknowns_of(experiments, FAULTS).candidates(point))
+    levels = np.minimum(paths + 1, MAX_JACK_HALVINGS)
     whole = anchored_derivatives(experiments, levels=levels)
 
     def round_about(end: Refinement, *, settled: bool = True) -> Refinement:

@@ -111,6 +111,8 @@ class PosteriorResult(msgspec.Struct, frozen=True, eq=False):
     """Whether the density converged."""
     residuals: Array
     """Weighted, at its mean, of a schedule that goes by the objective; shape (signals, N)."""
+    first: Array
+    """The same where the search began."""
 
 
 def search_posterior(
@@ -141,7 +143,7 @@ def search_posterior(
             history.add(density.x, linear.middle)
             if history.is_flat:
                 density = replace(density, x=history.x)
-                return PosteriorResult(density, linear, True, history.residuals)
+                return PosteriorResult(density, linear, True, history.residuals, history.first)
         whole = schedule.most_rounds - schedule.averaged_rounds
         share = 1.0 / (1 + max(rounds - whole, 0))
         density, ratio, step = _narrowed(
@@ -153,7 +155,7 @@ def search_posterior(
     if schedule.flat:
         history.add(density.x, model.many(density.x[None, :])[0])
         density = replace(density, x=history.x)
-    return PosteriorResult(density, linear, settled, history.residuals)
+    return PosteriorResult(density, linear, settled, history.residuals, history.first)
 
 
 class _ObjectiveHistory:
@@ -170,11 +172,13 @@ class _ObjectiveHistory:
         self._unit = 1.0
         self.x = prior.x
         """The best place."""
-        self.residuals = np.zeros((0, 0))
+        self.residuals = self.first = np.zeros((0, 0))
 
     def add(self, x: Array, residuals: Array) -> None:
         """Add a point and the residuals there, shape (signals, N)."""
         off = x - self._prior.x
+        if not self._objectives:
+            self.first = residuals
         objective = float(cauchy_cost(residuals) + off @ self._information @ off)
         if not self._objectives or objective < min(self._objectives):
             self.x, self.residuals = x, residuals

@@ -50,6 +50,20 @@ def noise_of_signal(values: Array, channel: Channel) -> float:
     return float(max(np.sqrt(np.median(quiet)) / QUIET_BLOCK_RATIO, rounding_noise(channel)))
 
 
+def median_of(values: Array) -> Array:
+    """Median along the last axis, shape (…, n): shape (…); no value may be missing.
+
+    The same as numpy's, which looks for three places in order and for missing values: a fifth of
+    its time.
+    """
+    middle = values.shape[-1] // 2
+    parts = np.partition(values, middle, axis=-1)
+    upper = parts[..., middle]
+    if values.shape[-1] % 2:
+        return np.asarray(upper)
+    return np.asarray((parts[..., :middle].max(axis=-1) + upper) / 2.0)
+
+
 def relative_noise(residuals: Array) -> float:
     """Noise that weighted residuals show, in units of the noise that weights them.
 
@@ -179,7 +193,7 @@ def commanded_current(
     difference = samples.current[finite] - current[finite]
     if difference.size == 0:
         return CurrentTrace(current, float("nan"), 0.0, True, command_deviation, guessed, step)
-    offset = float(np.median(difference))
+    offset = float(median_of(difference))
     residual_lsb = _kept_rms(difference - offset) / channels.current.grain
     rebuilt = residual_lsb < RECORDING.max_control_residual_lsb
     return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed, step)

@@ -254,15 +254,6 @@ def test_what_is_considered_may_be_run_in_turns():
     np.testing.assert_array_equal(first + second, whole)
 
 
-def test_what_is_considered_counts_on_the_rows_that_it_is_sized_by():
-    shape = rows(3, 1)[0] / 0.15e-6 / 10.0
-    item = ConsideredParameter(LEAD, 0.15e-6, (SPOOL_ROW,))
-    model = Derivatives(Formula(lambda *p: p[-1] * shape, (*FAULTS, LEAD)), NOISE, [item])
-    considered = model.at(np.full(len(FAULTS), 0.5))[1][0]
-    np.testing.assert_allclose(considered[SPOOL_ROW], 0.15e-6 * shape[SPOOL_ROW])
-    assert not considered[PRESSURE_ROW].any()
-
-
 def test_an_instant_of_sampling_acts_by_how_fast_a_signal_changes():
     """Beside a run of the model with that lead: the same but for what bends within two ticks."""
     experiment = own_experiment((0.3, 0.3, 0.3))
@@ -275,7 +266,8 @@ def test_an_instant_of_sampling_acts_by_how_fast_a_signal_changes():
         )
         for by_rate in (False, True)
     )
-    (expected,), (found,) = by_run.at(x / by_run.scale)[1], by_rate.at(x / by_run.scale)[1]
+    (expected,), residuals = by_run.at(x / by_run.scale)[1], by_rate.at(x / by_run.scale)[0][0]
+    (found,) = by_rate.held_effects(residuals)
     assert not found[PRESSURE_ROW].any()
     left = np.sqrt(np.mean((found - expected)[SPOOL_ROW] ** 2))
     assert left < 0.35 * np.sqrt(np.mean(expected[SPOOL_ROW] ** 2))

@@ -26,6 +26,7 @@ from ehadiag.identify.least_squares import (
 )
 from ehadiag.identify.linearisation import LinearModel, ParameterDensity, linearised_on_cross
 from ehadiag.identify.partial_refinement import anchored_derivatives, free_run_residuals
+from ehadiag.identify.signals import median_of
 from ehadiag.model.registry import FAULT_NAMES, parameter
 from ehadiag.model.registry import FAULTS as SEVERITIES
 from ehadiag.model.residual_models import SimdModel
@@ -229,3 +230,9 @@ def test_sums_of_lines_are_those_of_weighted_samples(samples):
         np.testing.assert_allclose(sums.gradient, (mine * weights) @ residuals.ravel(), atol=1e-11)
         expected = (residuals.ravel() ** 2 * weights).sum() / (variance * weights).sum()
         assert sums.excess == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(1,), (2,), (7,), (3, 8)])
+def test_median_is_that_of_numpy(shape):
+    values = np.round(np.random.default_rng(3).standard_normal(shape), 1)
+    np.testing.assert_array_equal(median_of(values), np.median(values, axis=-1))
