@@ -128,9 +128,9 @@ def test_the_deviations_are_those_of_the_package():
     assert memory[ONBOARD_GENES : 2 * ONBOARD_GENES] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize(("ticks", "doubtful"), [(2, False), (4, True)])
+@pytest.mark.parametrize(("ticks", "doubtful"), [(2, False), (5, True)])
 def test_a_break_away_that_a_calibration_moves_makes_friction_doubtful(ticks, doubtful):
-    """Two samples, four deviations off, are no break-away at another tick; four are one."""
+    """Two samples, four deviations off, are no break-away at another tick; five are one."""
     memory = np.zeros(ONBOARD.end)
     memory[ONBOARD.noise : ONBOARD.noise + 2] = 1.0
     memory[ONBOARD.along : ONBOARD.along + ONBOARD_GENES] = 1.0
