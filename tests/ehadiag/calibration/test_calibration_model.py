@@ -22,16 +22,21 @@ from ehadiag.calibration import calibrate_unit, model_choice
 from ehadiag.calibration.calibrate_unit import calibrate, learn_as_new
 from ehadiag.calibration.calibration_session import CalibrationSession, RecordingSelection
 from ehadiag.calibration.model_choice import QUICK_EFFECTS, choose_model, ordered_effects
-from ehadiag.calibration.unit_models import PLAYS_OF_SMOOTH_HYSTERESIS, UnitModel
+from ehadiag.calibration.unit_models import (
+    PLAYS_OF_SMOOTH_HYSTERESIS,
+    UnitModel,
+    learn_model,
+)
 from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
 from ehadiag.identify.estimates import calibrated_explanation_test, excess_cost, is_noise
+from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.linearisation import ParameterDensity
 from ehadiag.identify.nuisance_search import density_of_all_recordings
 from ehadiag.identify.prior import unit_prior
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, parameter
-from ehadiag_sim.conditions import DataErrors, Effects
+from ehadiag_sim.conditions import DataErrors, Effects, Sensors
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
 
 TESTS = bundled_tests()
@@ -286,6 +291,22 @@ def test_a_belief_keeps_its_values_and_correlations_in_other_units():
     units = np.diag([1.0, 1e-6]), np.diag([2.0, 1e-5])
     before, after = units[0] @ root, units[1] @ there.root
     assert after @ after.T == pytest.approx(before @ before.T, rel=1e-12)
+
+
+def test_a_filter_and_an_early_sample_are_told_from_one_another():
+    """The instant of sampling was held at 0, and the filter stood in for it."""
+    sensors, begun = Sensors(filter_time=1e-4, early=1.4e-4), default_actuator()
+    seen = record(Unit(sensors=sensors), TESTS["open"], seed=3, step=COARSE_STEP)
+
+    def build(actuator):
+        return [build_experiment(seen.samples, seen.environment, TESTS["open"], actuator)]
+
+    model = UnitModel(beside=("filter_time", "sampling_lead"))
+    learned = learn_model(model, build, begun, new=True, budget=1, seed=0)
+    values = learned.estimated.refined.values
+    assert values["filter_time"] == pytest.approx(sensors.filter_time, abs=5e-6)
+    assert values["sampling_lead"] == pytest.approx(sensors.early, abs=5e-6)
+    assert learned.estimated.explained
 
 
 @pytest.mark.slow
