@@ -407,8 +407,14 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         values = staged.model.named(staged.found.density.x)
         friction = min(max(values["FDJ"], 0.0), 1.0)
         slow = max(slip_speed(item.constants, friction) for item in experiments)
+        # In closed loop the jack reverses before a ring dies away: nothing would be left.
         sliding = [
-            item.sliding(slow, ring_out_time(item.constants, friction, item.pressure_noise))
+            item.sliding(
+                slow,
+                0.0
+                if item.test.closed_loop
+                else ring_out_time(item.constants, friction, item.pressure_noise),
+            )
             for item in experiments
         ]
         found = self._with(sliding, self.prior, values)
