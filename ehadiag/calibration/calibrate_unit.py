@@ -38,7 +38,7 @@ from ehadiag.core.actuator import Actuator, Calibration, CalibrationSource, Tole
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance_estimate import HYSTERESIS_NAME, NuisanceEstimate, estimate_nuisances
 from ehadiag.identify.nuisance_search import NuisanceSearchSettings
-from ehadiag.identify.partial_refinement import CONSIDERED_PARAMETERS
+from ehadiag.identify.partial_refinement import considered_instants
 from ehadiag.identify.prior import UnitPrior, data_errors_of_severities, unit_prior, usual_prior
 from ehadiag.identify.ring import Ring, ring_prior
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
@@ -274,6 +274,7 @@ def _refine_estimate(
     """
     loosened = knowledge.loosened()
     small = dict.fromkeys((item.name for item in FAULTS), 1e-3)
+    free = (*FAULTS, *SENSOR_OFFSETS, *knowledge.free)
     found: list[NuisanceEstimate] = []
     for turn in range(SEARCHES.searches_of_update):
         session.tell("learning", turn / SEARCHES.searches_of_update)
@@ -281,7 +282,7 @@ def _refine_estimate(
             estimate_nuisances(
                 experiments,
                 NuisanceSearchSettings(
-                    (*FAULTS, *SENSOR_OFFSETS, *knowledge.free),
+                    free,
                     priors=knowledge.priors,
                     joint=(
                         knowledge if turn < SEARCHES.searches_of_update // 2 else loosened
@@ -290,7 +291,7 @@ def _refine_estimate(
                     seed=session.seed + turn,
                     explains=knowledge.explains,
                 ),
-                CONSIDERED_PARAMETERS,
+                considered_instants(free),
             )
         )
         session.evaluations += found[-1].evaluations

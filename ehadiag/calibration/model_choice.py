@@ -327,8 +327,9 @@ def _with_one_play(session: CalibrationSession, found: LearnedModel) -> LearnedM
     places = (np.arange(count) + 0.5) / count
     mean_place = float(np.average(places, weights=np.exp(-skew * places)))
     begin = {**values, HYSTERESIS_NAME: 2.0 * mean_place * values[HYSTERESIS_NAME]}
-    others = tuple(name for name in significant_effects(found) if name != SKEW_NAME)
-    one_play = _learn_from(session, replace(found.model, plays=1), others, begin, 0)
+    # The skew may stand for other effects, as the gain of a sensor.
+    others = {*QUICK_EFFECTS, *significant_effects(found)} - {SKEW_NAME}
+    one_play = _learn_effects(session, replace(found.model, plays=1), others, 0, begin)
     if found.estimated.explained and not one_play.estimated.explained:
         return found
     more = one_play.criterion - found.criterion

@@ -22,7 +22,7 @@ from ehadiag.identify.experiment import (
 )
 from ehadiag.identify.nuisance_estimate import NuisanceEstimate, estimate_nuisances
 from ehadiag.identify.nuisance_search import NuisanceSearchSettings
-from ehadiag.identify.partial_refinement import CONSIDERED_PARAMETERS
+from ehadiag.identify.partial_refinement import considered_instants
 from ehadiag.identify.posterior import cauchy_cost
 from ehadiag.identify.prior import (
     FAULT_OF_DATUM,
@@ -336,7 +336,7 @@ def learn_model(
             progress=tell,
             give_up=brief,
         ),
-        CONSIDERED_PARAMETERS,
+        considered_instants(free),
     )
     return LearnedModel(model, experiments, found, _criterion(found, len(free)))
 

@@ -140,11 +140,19 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         bridge = bridge if exponent > 0.0 else 0.0
         return replace(self, constants=self.constants._replace(CLE=exponent, BRG=bridge))
 
-    def sliding(self, slip_speed: float) -> Experiment:
-        """Return the same without the pressure on a jack that stands or slides more slowly."""
+    def sliding(self, slip_speed: float, ring_out: float = 0.0) -> Experiment:
+        """Return the same without the pressure on a jack that stands or slides more slowly.
+
+        ring_out: time for which it rings on after that, s, and is left out, too.
+        """
         if slip_speed == 0.0:
             return self
         slow = slow_ticks(self.position, self.channels.position, slip_speed * self.tick)
+        if ring_out > 0.0:
+            # `slow_ticks` sees a motion as many ticks before it begins.
+            count, ticks = SLIP_TICKS + round(ring_out / self.tick), np.arange(len(slow))
+            latest = np.maximum.accumulate(np.where(slow, ticks, -count))
+            slow = ticks - latest < count
         return replace(self, pressure=np.where(slow, np.nan, self.pressure))
 
     @property

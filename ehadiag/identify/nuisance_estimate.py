@@ -61,7 +61,7 @@ from ehadiag.identify.posterior import (
 from ehadiag.identify.prior import UnitPrior, prior_density, prior_information
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
-from ehadiag.model.plant import slip_speed
+from ehadiag.model.plant import ring_out_time, slip_speed
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.severities import FAULT_LAWS
 
@@ -419,10 +419,18 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             better, doubted = self._other_exponent(experiments, found, found)
             return replace(found, better_exponent=better, exponent_doubted=doubted)
         values = staged.model.named(staged.found.density.x)
-        slow = max(
-            slip_speed(item.constants, min(max(values["FDJ"], 0.0), 1.0)) for item in experiments
-        )
-        sliding = [item.sliding(slow) for item in experiments]
+        friction = min(max(values["FDJ"], 0.0), 1.0)
+        slow = max(slip_speed(item.constants, friction) for item in experiments)
+        # In closed loop the jack reverses before a ring dies away: nothing would be left.
+        sliding = [
+            item.sliding(
+                slow,
+                0.0
+                if item.test.closed_loop
+                else ring_out_time(item.constants, friction, item.pressure_noise),
+            )
+            for item in experiments
+        ]
         found = self._with(sliding, self.prior, values)
         loose = self._with_changed_effects(sliding, found, values, budget=1)
         better, doubted = self._other_exponent(sliding, found, loose)

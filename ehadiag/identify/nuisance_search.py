@@ -253,6 +253,8 @@ def _take_off_offsets(model: Derivatives, points: Array, runs: Array) -> None:
         if item.adds_to is not None and item.adds_to < slopes.shape[1]:
             slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
             used = slope != 0.0
+            if not used.any():  # none of the pressure counts on a jack that slips throughout
+                continue
             offsets = median_of(run[:, used] / slope[used])
             points[:, k] -= offsets
             run -= offsets[:, None] * slope

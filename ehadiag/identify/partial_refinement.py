@@ -228,12 +228,18 @@ def anchored_derivatives(
     return Derivatives(model, experiments[0].noise, considered)
 
 
+def considered_instants(free: Sequence[Parameter]) -> tuple[ConsideredParameter, ...]:
+    """`CONSIDERED_PARAMETERS` but for those that are free: held as well they would stay at 0."""
+    names = {item.name for item in free}
+    return tuple(item for item in CONSIDERED_PARAMETERS if item.parameter.name not in names)
+
+
 def considered_parameters(
     experiments: Sequence[Experiment], free: Sequence[Parameter] = ()
 ) -> tuple[ConsideredParameter, ...]:
     """Parameters that move in the last round alone, each with a density of its own about 0.
 
-    `CONSIDERED_PARAMETERS`, and oil and supply by their steps on the bus, unless they are free.
+    `considered_instants`, and oil and supply by their steps on the bus, unless they are free.
     """
     stds = {
         "oil_viscosity": max(item.viscosity_std for item in experiments),
@@ -241,7 +247,7 @@ def considered_parameters(
     }
     names = {item.name for item in free}
     return (
-        *CONSIDERED_PARAMETERS,
+        *considered_instants(free),
         *(
             ConsideredParameter(parameter(name), std)
             for name, std in stds.items()

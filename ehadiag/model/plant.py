@@ -204,6 +204,22 @@ def slip_speed(c: PlantConstants, severity: float = 0.0) -> float:
     return float(SLIP_SPEED_RATIO * friction / (c.AJ * math.sqrt(c.OIL * c.MJ)))
 
 
+def ring_out_time(c: PlantConstants, severity: float, noise: float) -> float:
+    """Time, s, in which a jack that slides forgets at what phase it slipped before.
+
+    Steps leave it somewhere in the band of its friction. By then a ring of the whole band is less
+    than the noise of the pressure, Pa: viscous friction damps it, and the lands, through which less
+    flows against more pressure, at `slip_speed` at least. severity: of `FDJ`. Without oil in the
+    second stage nothing rings: 0.
+    """
+    if c.OIL == 0.0:
+        return 0.0
+    friction = c.FDJ + severity * (c.FDJ1 - c.FDJ)
+    lands = c.AJ * slip_speed(c, severity) / (2.0 * c.PSR)
+    rate = 0.5 * (c.CJ / c.MJ + c.OIL * lands)
+    return float(max(math.log(2.0 * friction / (c.AJ * noise)), 0.0) / rate)
+
+
 def plant_constants(actuator: Actuator, environment: Environment | None = None) -> PlantConstants:
     """Constants of the unit as new, at the oil temperature and supply that the bus reports.
 

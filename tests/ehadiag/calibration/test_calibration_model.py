@@ -22,16 +22,21 @@ from ehadiag.calibration import calibrate_unit, model_choice
 from ehadiag.calibration.calibrate_unit import calibrate, learn_as_new
 from ehadiag.calibration.calibration_session import CalibrationSession, RecordingSelection
 from ehadiag.calibration.model_choice import QUICK_EFFECTS, choose_model, ordered_effects
-from ehadiag.calibration.unit_models import PLAYS_OF_SMOOTH_HYSTERESIS, UnitModel
+from ehadiag.calibration.unit_models import (
+    PLAYS_OF_SMOOTH_HYSTERESIS,
+    UnitModel,
+    learn_model,
+)
 from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
 from ehadiag.identify.estimates import calibrated_explanation_test, excess_cost, is_noise
+from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.linearisation import ParameterDensity
 from ehadiag.identify.nuisance_search import density_of_all_recordings
 from ehadiag.identify.prior import unit_prior
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, parameter
-from ehadiag_sim.conditions import DataErrors, Effects
+from ehadiag_sim.conditions import DataErrors, Effects, Sensors
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
 
 TESTS = bundled_tests()
@@ -165,15 +170,21 @@ def test_a_hysteresis_that_leans_to_its_widest_plays_is_one_play_if_that_costs_n
     further, monkeypatch, skew, more, plays
 ):
     """With the skewed one `FSS` was 0.00 (0 … 0.03) and sure for 0.51, in closed loop."""
-    monkeypatch.setattr(model_choice, "significant_effects", lambda _found: (SKEW, "load"))
+
+    def asked_for(found):
+        return ("load",) if found.model.plays == 1 else (SKEW, "load")
+
+    monkeypatch.setattr(model_choice, "significant_effects", asked_for)
     session = Told(
         lambda model: (0.0, 0.0) if model.rich else (5.0, 9.0),
         skew=skew,
-        costs=lambda model: more if model.rich and model.plays == 1 else 0.0,
+        costs=lambda model: more + len(model.beside) if model.rich and model.plays == 1 else 0.0,
     )
     model = choose_model(session, session.start, compare=False)[-1].model
-    _, how = session.asked[-1]
     if skew < -1.0:
+        one_play, how = next(item for item in session.asked if item[0].rich and item[0].plays == 1)
+        # The skew may have stood for others.
+        assert {"spool_gain", "load"} < set(one_play.beside)
         assert how["hint"]["hysteresis"] == pytest.approx(0.02 * 1.656, rel=1e-3)
     assert model.plays == plays
     assert model.beside == (("load",) if plays == 1 else (SKEW,))
@@ -286,6 +297,22 @@ def test_a_belief_keeps_its_values_and_correlations_in_other_units():
     units = np.diag([1.0, 1e-6]), np.diag([2.0, 1e-5])
     before, after = units[0] @ root, units[1] @ there.root
     assert after @ after.T == pytest.approx(before @ before.T, rel=1e-12)
+
+
+def test_a_filter_and_an_early_sample_are_told_from_one_another():
+    """The instant of sampling was held at 0, and the filter stood in for it."""
+    sensors, begun = Sensors(filter_time=1e-4, early=1.4e-4), default_actuator()
+    seen = record(Unit(sensors=sensors), TESTS["open"], seed=3, step=COARSE_STEP)
+
+    def build(actuator):
+        return [build_experiment(seen.samples, seen.environment, TESTS["open"], actuator)]
+
+    model = UnitModel(beside=("filter_time", "sampling_lead"))
+    learned = learn_model(model, build, begun, new=True, budget=1, seed=0)
+    values = learned.estimated.refined.values
+    assert values["filter_time"] == pytest.approx(sensors.filter_time, abs=5e-6)
+    assert values["sampling_lead"] == pytest.approx(sensors.early, abs=5e-6)
+    assert learned.estimated.explained
 
 
 @pytest.mark.slow
