@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.assess.verdict import Levels, Verdict
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
@@ -28,7 +29,8 @@ AGREEMENT = 0.2
 """Largest relative difference of derivatives by both widths, 1; others are left out."""
 HEADINGS = (
     "severity", "cases", "answered", "sure and wrong", "bias", "mean", "p95", "worst",
-    "intervals that hold", "coverage of 95 %", "mean width", "rms / Cramér–Rao bound",
+    "beyond 5 deviations", "intervals that hold", "coverage of 95 %", "mean width",
+    "rms / Cramér–Rao bound",
 )  # fmt: skip
 LEVEL_MARGIN = 0.02
 """Distance of a severity from a level within which either class will do, 1."""
@@ -62,6 +64,15 @@ def holds_truth(records: Sequence[Record]) -> NDArray[np.bool_]:
     truth = np.array([record["faults"] for record in records])
     low, high = interval[..., 0], interval[..., 1]
     return np.asarray((low <= truth + ROUNDING) & (truth - ROUNDING <= high))
+
+
+def deviations(records: Sequence[Record]) -> Array:
+    """Errors in deviations, shape (n, 3), by the half of the interval that no bound cuts."""
+    interval = np.array([record["interval95"] for record in records])
+    value = np.array([record["value"] for record in records])
+    half = np.maximum(interval[..., 1] - value, value - interval[..., 0])
+    error = percent_errors(records) / 100.0
+    return np.asarray(error * NORMAL_HALF_WIDTH_95 / np.maximum(half, ROUNDING))
 
 
 def is_answered(record: Record) -> bool:
@@ -114,11 +125,12 @@ def _error_cells(
         f"{np.quantile(np.abs(error).mean(axis=1), 0.95):.4f}", f"{np.abs(error).max():.4f}",
     ]  # fmt: skip
     if not answered:
-        return [*cells, "0 of 0", "–", "–", "–"]
+        return [*cells, "–", "0 of 0", "–", "–", "–"]
     held = holds_truth(answered)[:, column]
     interval = np.array([item["interval95"] for item in answered])
     width = 100.0 * (interval[..., 1] - interval[..., 0])[:, column].mean()
-    cells += [f"{held.sum()} of {held.size}", f"{100.0 * held.mean():.1f} %", f"{width:.3f}"]
+    far = int((np.abs(deviations(answered)[:, column]) > 5.0).sum())
+    cells += [str(far), f"{held.sum()} of {held.size}", f"{100.0 * held.mean():.1f} %", f"{width:.3f}"]
     return [*cells, _over_bound(estimated, column)]
 
 
