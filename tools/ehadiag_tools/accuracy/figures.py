@@ -130,7 +130,12 @@ def _error_cells(
     interval = np.array([item["interval95"] for item in answered])
     width = 100.0 * (interval[..., 1] - interval[..., 0])[:, column].mean()
     far = int((np.abs(deviations(answered)[:, column]) > 5.0).sum())
-    cells += [str(far), f"{held.sum()} of {held.size}", f"{100.0 * held.mean():.1f} %", f"{width:.3f}"]
+    cells += [
+        str(far),
+        f"{held.sum()} of {held.size}",
+        f"{100.0 * held.mean():.1f} %",
+        f"{width:.3f}",
+    ]
     return [*cells, _over_bound(estimated, column)]
 
 
