@@ -32,7 +32,7 @@ by less than `MAX_BENT` between break-aways."""
 MAX_BENT = 0.5
 """Most by which the model may leave a line within such differences, in deviations of the noise,
 which then is more than that: the tick of a break-away does."""
-PARTS = 16
+PARTS_OF_TICK = 16
 """Parts of a tick that the model runs through one by one, 1: a cubic lies through the ends of four
 of them, and behind a step of the current the flapper takes a fifth of a tick."""
 
@@ -142,14 +142,14 @@ def _sampled(taken: _SampledTest, clock: _Clock) -> _Samples:
     return _Samples(np.stack(values), np.stack(before))
 
 
-class _Response:
+class _FineResponse:
     """Response of the model within the ticks, in deviations of the noise."""
 
     def __init__(self, taken: _SampledTest, severities: Array) -> None:
-        self._step = taken.experiment.tick / PARTS
+        self._step = taken.experiment.tick / PARTS_OF_TICK
         # The ends of the parts from that of this tick back to that of the tick before.
         grid = np.moveaxis(
-            taken.response(severities, 0.0, PARTS).reshape(2, -1, PARTS)[..., ::-1], 2, 0
+            taken.response(severities, 0.0, PARTS_OF_TICK).reshape(2, -1, PARTS_OF_TICK)[..., ::-1], 2, 0
         )
         start = np.concatenate([grid[-1:, :, :1], grid[:1, :, :-1]], axis=2)
         self._grid = np.concatenate([grid, start])
@@ -187,7 +187,7 @@ class _Fit(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def of(cls, taken: _SampledTest, severities: Array, clock: _Clock) -> _Fit:
         samples = _sampled(taken, clock)
-        return cls(severities, clock, samples, *_Response(taken, severities).at(samples.before))
+        return cls(severities, clock, samples, *_FineResponse(taken, severities).at(samples.before))
 
     def cost(self, lines: _Lines) -> float:
         """Mean of Cauchy's cost of the residuals, offsets and what breaks away aside, 1."""
@@ -221,7 +221,7 @@ class _Lines(msgspec.Struct, frozen=True, eq=False):
             low, between, high = (
                 here
                 if x[index] == value
-                else np.stack([_Response(taken, x).at(before)[0], taken.response(x, wanted)])
+                else np.stack([_FineResponse(taken, x).at(before)[0], taken.response(x, wanted)])
                 for x in points
             )
             slopes.append((high[0] - low[0]) / (2.0 * step))

@@ -12,7 +12,7 @@ from firmware_iface.mapping_file import UdsIdentifiers
 from firmware_iface.uds.services import (
     DATA_RECORDS,
     NEGATIVE_RESPONSE,
-    ONBOARD,
+    ONBOARD_RESULT,
     POSITIVE_OFFSET,
     SNAPSHOT_RECORD,
     TEST_OPTION,
@@ -248,8 +248,8 @@ def _dictionary(records: Sequence[DataRecord]) -> Node:
     snapshot = [
         _constant("RecordNumber", SNAPSHOT_RECORD, 1, 0),
         _constant("Identifiers", 1, 1, 1),
-        _constant("DataIdentifier", ONBOARD.number, 2, 2),
-        *_fields(ONBOARD, 4),
+        _constant("DataIdentifier", ONBOARD_RESULT.number, 2, 2),
+        *_fields(ONBOARD_RESULT, 4),
     ]
     structures = [
         _named("STRUCTURE", name, _list("PARAMS", params), ID=f"Structure.{name}")

@@ -319,7 +319,7 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
-def _may_stick_elsewhere(found: NuisanceEstimate) -> bool:
+def _may_gain_by_following(found: NuisanceEstimate) -> bool:
     """Whether a model that follows the spool's sensor before the motion may explain more.
 
     Running free it may stick elsewhere; other friction then explains the rest but for a break-away.
@@ -359,7 +359,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
         found = self._with(experiments, self.prior, hint, budget=budget)
-        if any(creeps) and _may_stick_elsewhere(found):
+        if any(creeps) and _may_gain_by_following(found):
             followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)

@@ -27,7 +27,7 @@ MAX_STD: Final = 0.05
 """Largest standard error with which a severity is stated, 1."""
 MAX_STEPS: Final = 1.0
 """Largest change that is stated, steps of the bank, whose sensitivities are those of one step."""
-MODEL_ERRORS: Final = np.array([0.05, 0.1, 0.02])
+SEVERITY_MODEL_ERRORS: Final = np.array([0.05, 0.1, 0.02])
 """Standard error of the model that looks like a severity, deviations of the noise, by 21 pieces of
 10 min of the twelve kinds that the thresholds of changes come from."""
 NONLINEARITY: Final = 0.3
@@ -107,5 +107,5 @@ class FlightEstimate:
         scatter = root @ (left.T @ left + held) @ root
         own, change = np.diagonal(root)[severities], sizes[severities]
         variance = np.maximum(np.diagonal(scatter)[severities], own)
-        variance += MODEL_ERRORS**2 * self._ticks * own + (NONLINEARITY * change) ** 2
+        variance += SEVERITY_MODEL_ERRORS**2 * self._ticks * own + (NONLINEARITY * change) ** 2
         return change, np.sqrt(variance)

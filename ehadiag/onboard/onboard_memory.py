@@ -243,7 +243,7 @@ class ChannelSums(NamedTuple):
 
 
 CHANNEL_SUMS: Final = len(ChannelSums._fields)
-CHANNELS: Final = 3
+CHANNEL_COUNT: Final = 3
 """Spool, pressure, position."""
 CORRELATED_TICKS: Final = ESTIMATION.correlation_lags + 1
 """Ticks over which residuals are correlated, 1."""
@@ -258,7 +258,7 @@ ONBOARD: Final = OnboardPlaces(
             ONBOARD_GENES + 1, 2,
             UNKNOWNS_MATRIX_SIZE + ONBOARD_UNKNOWNS, ONBOARD_UNKNOWNS, UNKNOWNS_MATRIX_SIZE,
             ONBOARD_UNKNOWNS, 3 * ONBOARD_GENES,
-            CORRELATED_TICKS * ONBOARD_UNKNOWNS, CHANNELS * CHANNEL_SUMS, SUMS,
+            CORRELATED_TICKS * ONBOARD_UNKNOWNS, CHANNEL_COUNT * CHANNEL_SUMS, SUMS,
             4 * HISTOGRAM_BINS, 4 * MATRIX_SIZE + 8 * ONBOARD_PARAMETERS,
             ONBOARD_MODELS * MONITOR_SIZE)
 )  # fmt: skip

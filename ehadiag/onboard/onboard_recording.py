@@ -11,7 +11,7 @@ from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.monitor.monitor_memory import MONITOR_UNIT_SIZE
 from ehadiag.onboard.onboard_memory import (
     CHANNEL_SUMS,
-    CHANNELS,
+    CHANNEL_COUNT,
     ONBOARD,
     ONBOARD_GENES,
     PLAN_TEST_SIZE,
@@ -43,14 +43,14 @@ DIGEST_BITS_LOST = 12
 
 @merged
 def channel_sums_at(address: int) -> Array:
-    """What a pass counts of spool, pressure and position, shape (CHANNELS, CHANNEL_SUMS)."""
-    return array_at(address + BYTES_PER_NUMBER * ONBOARD.channels, (CHANNELS, CHANNEL_SUMS))
+    """What a pass counts of spool, pressure and position, shape (CHANNEL_COUNT, CHANNEL_SUMS)."""
+    return array_at(address + BYTES_PER_NUMBER * ONBOARD.channels, (CHANNEL_COUNT, CHANNEL_SUMS))
 
 
 @inlined_exact
 def clear_channels(sums: Array) -> None:
     """Begin to count."""
-    for c in range(CHANNELS):
+    for c in range(CHANNEL_COUNT):
         for i in range(CHANNEL_SUMS):
             sums[c, i] = 0.0
         sums[c, LAST] = sums[c, EARLIER] = math.nan
@@ -74,7 +74,7 @@ def look_at_tick(address: int, plan: Array, ticks: Array, k: int) -> None:
     p, sums, r = array_at(address, (ONBOARD.end,)), channel_sums_at(address), verdict_rules_of(plan)
     if ticks[k, 0] != 0.0:
         p[MOVED] = 1.0
-    for c in range(CHANNELS):
+    for c in range(CHANNEL_COUNT):
         low, high = r.spool_low, r.spool_high
         if c == 1:
             low, high = r.pressure_low, r.pressure_high
@@ -103,7 +103,7 @@ def recording_reasons(address: int, plan: Array, count: int) -> float:
     unit = array_at(address + BYTES_PER_NUMBER * ONBOARD.unit, (MONITOR_UNIT_SIZE,))
     reasons = 0.0
     lost, frozen, cut = False, False, False
-    for c in range(CHANNELS):
+    for c in range(CHANNEL_COUNT):
         cut = cut or sums[c, CUT] > r.most_saturated * count
         if c == 2:
             break  # a frozen position is none of the model's

@@ -30,7 +30,7 @@ from firmware_iface.transport.frames import Frame
 from firmware_iface.uds.services import (
     FAILED_STATUS,
     OFFSETS,
-    ONBOARD,
+    ONBOARD_RESULT,
     REFUSALS,
     SERIAL,
     SOFTWARE,
@@ -236,7 +236,7 @@ class UdsClient:
         """Queue requests of the computer's own result, sensor offsets, identity, trouble codes."""
         self._polls = False
         self._queue.clear()
-        self._queue.extend(_data(item) for item in (ONBOARD, OFFSETS, SERIAL, SOFTWARE))
+        self._queue.extend(_data(item) for item in (ONBOARD_RESULT, OFFSETS, SERIAL, SOFTWARE))
         report, mask = DtcReport.BY_STATUS_MASK, FAILED_STATUS
         self._queue.append(
             _Exchange(
@@ -337,8 +337,8 @@ class UdsClient:
         try:
             if exchange.record is None:
                 self._facts["trouble codes"] = _trouble_codes(data[1:])
-            elif exchange.record is ONBOARD:
-                values = ONBOARD.numbers(data)
+            elif exchange.record is ONBOARD_RESULT:
+                values = ONBOARD_RESULT.numbers(data)
                 if values["state"] in BUSY_ONBOARD:
                     self._queue.append(replace(exchange, not_before=now + ONBOARD_PERIOD_NS))
                 elif values["state"] == OnboardState.DONE:

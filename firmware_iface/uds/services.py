@@ -148,7 +148,7 @@ SOFTWARE = DataRecord(
     (DataField("software", 16, text=True, meaning="ASCII, filled up by 0"),),
     "version of the computer's software",
 )
-ONBOARD = DataRecord(
+ONBOARD_RESULT = DataRecord(
     "OnboardResult",
     0x0120,
     (
@@ -173,11 +173,11 @@ OFFSETS = DataRecord(
     ),
     "offsets of the sensors that the computer knows",
 )
-DATA_RECORDS = {item.number: item for item in (ONBOARD, OFFSETS, SERIAL, SOFTWARE)}
+DATA_RECORDS = {item.number: item for item in (ONBOARD_RESULT, OFFSETS, SERIAL, SOFTWARE)}
 """Answers of 0x22 by their identifiers."""
 
 SNAPSHOT_RECORD = 1
-"""Number of the only snapshot of a trouble code; it holds `ONBOARD`."""
+"""Number of the only snapshot of a trouble code; it holds `ONBOARD_RESULT`."""
 
 
 class TroubleCode(msgspec.Struct, frozen=True):

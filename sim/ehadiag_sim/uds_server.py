@@ -25,7 +25,7 @@ from firmware_iface.uds.services import (
     FAILED_STATUS,
     NEGATIVE_RESPONSE,
     OFFSETS,
-    ONBOARD,
+    ONBOARD_RESULT,
     POSITIVE_OFFSET,
     REFUSALS,
     SERIAL,
@@ -149,7 +149,7 @@ class UdsServer:
         if number == OFFSETS.number:
             pairs = zip(CHANNELS, self._computer.offsets, strict=True)
             return {channel.name: value / channel.per_unit for channel, value in pairs}
-        assert number == ONBOARD.number
+        assert number == ONBOARD_RESULT.number
         return self._onboard()
 
     def _onboard(self) -> dict[str, float | str]:
@@ -214,8 +214,8 @@ class UdsServer:
             raise NegativeResponseError(ResponseCode.REQUEST_OUT_OF_RANGE)
         answer = _dtc((number, status[number]))
         if status[number] & DtcStatus.TEST_FAILED:
-            answer += bytes([SNAPSHOT_RECORD, 1]) + ONBOARD.number.to_bytes(2, "big")
-            answer += ONBOARD.encode(self._onboard())
+            answer += bytes([SNAPSHOT_RECORD, 1]) + ONBOARD_RESULT.number.to_bytes(2, "big")
+            answer += ONBOARD_RESULT.encode(self._onboard())
         return answer
 
 
