@@ -149,7 +149,9 @@ class _FineResponse:
         self._step = taken.experiment.tick / PARTS_OF_TICK
         # The ends of the parts from that of this tick back to that of the tick before.
         grid = np.moveaxis(
-            taken.response(severities, 0.0, PARTS_OF_TICK).reshape(2, -1, PARTS_OF_TICK)[..., ::-1], 2, 0
+            taken.response(severities, 0.0, PARTS_OF_TICK).reshape(2, -1, PARTS_OF_TICK)[..., ::-1],
+            2,
+            0,
         )
         start = np.concatenate([grid[-1:, :, :1], grid[:1, :, :-1]], axis=2)
         self._grid = np.concatenate([grid, start])

@@ -10,8 +10,8 @@ from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.monitor.monitor_memory import MONITOR_UNIT_SIZE
 from ehadiag.onboard.onboard_memory import (
-    CHANNEL_SUMS,
     CHANNEL_COUNT,
+    CHANNEL_SUMS,
     ONBOARD,
     ONBOARD_GENES,
     PLAN_TEST_SIZE,
