@@ -188,7 +188,11 @@ def uds_tables() -> str:
         ),
         *((f"22 {item.number:04X}", item.meaning, item.name) for item in uds.DATA_RECORDS.values()),
         ("19 02 MASK", "trouble codes with a bit of the mask", "mask, codes with their status"),
-        (f"19 04 CODE {snapshot}", "what set a trouble code", f"code, status, {uds.ONBOARD_RESULT.name}"),
+        (
+            f"19 04 CODE {snapshot}",
+            "what set a trouble code",
+            f"code, status, {uds.ONBOARD_RESULT.name}",
+        ),
         ("19 0A", "all trouble codes", "mask, codes with their status"),
     ]
     fields = [
