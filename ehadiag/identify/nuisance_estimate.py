@@ -179,7 +179,8 @@ def estimate_about(
                 if settings.explains(residuals) and not _has_event(residuals, creeps):
                     break
             judged = items
-            if _has_event(residuals, fine.model.batch.weight > 0.0):
+            counted = fine.model.batch.weight > 0.0
+            if settings.explains(residuals) and _has_event(residuals, counted):
                 wide = replace(density, root=RESTARTS.event_spread * density.root)
                 density = search(fine, begin=wide).density
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
