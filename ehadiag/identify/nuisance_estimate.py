@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import BREAK_AWAYS, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
+from ehadiag.core.criteria import BREAK_AWAYS, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95, RECORDING
 from ehadiag.identify.estimates import (
     estimate_covariance,
     excess_cost,
@@ -181,8 +181,8 @@ def estimate_about(
             judged = items
             counted = fine.model.batch.weight > 0.0
             if settings.explains(residuals) and _has_event(residuals, counted):
-                wide = replace(density, root=RESTARTS.event_spread * density.root)
-                density = search(fine, begin=wide).density
+                wide = RESTARTS.event_spread * density.root
+                density = _search_about(fine, search, density, wide)
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
@@ -279,7 +279,7 @@ def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
     ticks = count * BREAK_AWAYS.block
     costs = cauchy_costs(residuals[:, :ticks]).sum(axis=0).reshape(count, -1).sum(axis=1)
     among = counted[:, :ticks].any(axis=0).reshape(count, -1).any(axis=1)
-    over = costs[among] - np.median(costs)
+    over = costs[among] - np.median(costs[among]) if among.any() else np.zeros(1)
     return bool(over.max(initial=0.0) > BREAK_AWAYS.event_cost)
 
 
@@ -311,8 +311,16 @@ def _ends_covariance(found: MultistartResult, scale: Array) -> Array:
 
 
 def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEstimate:
-    """The further estimate if it explains more of the recordings, with the effort of both."""
-    best = max(further, found, key=lambda item: (item.explained, -item.excess))
+    """The further estimate if it explains more of the recordings, with the effort of both.
+
+    Of two that explain them the one without a break-away at a wrong tick does.
+    """
+
+    def explains(item: NuisanceEstimate) -> tuple[bool, bool, float]:
+        event = _has_event(item.refined.residuals, item.refined.weighted)
+        return item.explained, not (item.explained and event), -item.excess
+
+    best = max(found, further, key=explains)
     return replace(
         best,
         evaluations=found.evaluations + further.evaluations,
@@ -320,15 +328,39 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
-def _may_gain_by_following(found: NuisanceEstimate) -> bool:
+def without_slips(experiment: Experiment, slip_speed: float, severity: float) -> Experiment:
+    """Experiment without the pressure on a jack that slips in steps, and the ring of the last one.
+
+    The ring is left out in part where less than `RECORDING.min_samples` of the pressure would stay;
+    in closed loop, where the jack reverses before a ring dies away, not at all. severity: of `FDJ`.
+    """
+    ring_out = 0.0
+    if not experiment.test.closed_loop:
+        ring_out = ring_out_time(experiment.constants, severity, experiment.pressure_noise)
+    while True:
+        out = experiment.sliding(slip_speed, ring_out)
+        enough = np.isfinite(out.pressure).sum() >= RECORDING.min_samples
+        if enough or ring_out == 0.0:
+            return out
+        ring_out = 0.5 * ring_out if ring_out > experiment.tick else 0.0
+
+
+def _may_gain_by_following(
+    experiments: Sequence[Experiment], found: NuisanceEstimate, *, exact: bool
+) -> bool:
     """Whether a model that follows the spool's sensor before the motion may explain more.
 
     Running free it may stick elsewhere; other friction then explains the rest but for a break-away.
+    exact: whether what is explained leaves but noise, so that such a break-away shows.
     """
     left = found.refined.residuals
-    if found.explained:
-        return _has_event(left, found.refined.weighted)
-    return not _leaves_too_much(left)
+    if not found.explained:
+        return not _leaves_too_much(left)
+    parts = residuals_by_experiment(experiments, np.where(found.refined.weighted, left, 0.0))
+    return exact and any(
+        item.creeps and _has_event(part, part != 0.0)
+        for item, part in zip(experiments, parts, strict=True)
+    )
 
 
 def _leaves_too_much(residuals: Array) -> bool:
@@ -360,7 +392,8 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         # Most are explained by one start without following the sensor, which costs more looks.
         budget = 1 if all(creeps) else NUISANCE_RUN_BUDGET
         found = self._with(experiments, self.prior, hint, budget=budget)
-        if any(creeps) and _may_gain_by_following(found):
+        exact = self.prior.joint is None
+        if any(creeps) and _may_gain_by_following(experiments, found, exact=exact):
             followed = self._with(experiments, self.prior, hint, follow=True)
             found = _better_of(found, followed)
         begins_as_read = any(item.origin_read and not item.creeps for item in experiments)
@@ -422,16 +455,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         values = staged.model.named(staged.found.density.x)
         friction = min(max(values["FDJ"], 0.0), 1.0)
         slow = max(slip_speed(item.constants, friction) for item in experiments)
-        # In closed loop the jack reverses before a ring dies away: nothing would be left.
-        sliding = [
-            item.sliding(
-                slow,
-                0.0
-                if item.test.closed_loop
-                else ring_out_time(item.constants, friction, item.pressure_noise),
-            )
-            for item in experiments
-        ]
+        sliding = [without_slips(item, slow, friction) for item in experiments]
         found = self._with(sliding, self.prior, values)
         loose = self._with_changed_effects(sliding, found, values, budget=1)
         better, doubted = self._other_exponent(sliding, found, loose)

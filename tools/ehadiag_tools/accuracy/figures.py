@@ -27,9 +27,11 @@ STEPS = (2e-5, 5e-6)
 """Half-widths of the differences for derivatives, 1; the wide and the narrow one."""
 AGREEMENT = 0.2
 """Largest relative difference of derivatives by both widths, 1; others are left out."""
+FAR_OFF = 5.0
+"""Error in stated deviations from which an estimate is wrong without a word, 1."""
 HEADINGS = (
     "severity", "cases", "answered", "sure and wrong", "bias", "mean", "p95", "worst",
-    "beyond 5 deviations", "intervals that hold", "coverage of 95 %", "mean width",
+    f"beyond {FAR_OFF:g} deviations", "intervals that hold", "coverage of 95 %", "mean width",
     "rms / Cramér–Rao bound",
 )  # fmt: skip
 LEVEL_MARGIN = 0.02
@@ -129,7 +131,7 @@ def _error_cells(
     held = holds_truth(answered)[:, column]
     interval = np.array([item["interval95"] for item in answered])
     width = 100.0 * (interval[..., 1] - interval[..., 0])[:, column].mean()
-    far = int((np.abs(deviations(answered)[:, column]) > 5.0).sum())
+    far = int((np.abs(deviations(answered)[:, column]) > FAR_OFF).sum())
     cells += [
         str(far),
         f"{held.sum()} of {held.size}",

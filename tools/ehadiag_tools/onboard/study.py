@@ -46,7 +46,7 @@ from ehadiag_tools.accuracy.cases import (
     random_days,
     record_worn,
 )
-from ehadiag_tools.accuracy.figures import accuracy_table, is_answered
+from ehadiag_tools.accuracy.figures import FAR_OFF, accuracy_table, is_answered
 from ehadiag_tools.onboard.replay import (
     EMULATED,
     identified,
@@ -239,8 +239,6 @@ ONBOARD = Study(
 
 GOES_ON = 1
 """What a slice returns before the last one."""
-FAR_OFF = 5.0
-"""Error in stated deviations from which an estimate is wrong without a word, 1."""
 TESTS = ("open", "closed")
 SLICE = 1e5
 """Ticks of a model in a slice, 1: seldom enough to cost nothing."""
