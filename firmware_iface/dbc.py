@@ -84,11 +84,12 @@ class SignalLayout(msgspec.Struct, frozen=True, dict=True):
 
     def physical(self, data: NDArray[np.uint8]) -> FloatArray:
         """Physical value in the DBC's unit, shape (n,)."""
-        raw = self.raw(data).astype(np.float64)
-        if self.scale != 1.0:
-            raw *= self.scale
-        if self.offset != 0.0:
-            raw += self.offset
+        with np.errstate(invalid="ignore"):  # a signalling NaN comes out as a quiet one
+            raw = self.raw(data).astype(np.float64)
+            if self.scale != 1.0:
+                raw *= self.scale
+            if self.offset != 0.0:
+                raw += self.offset
         return raw
 
     def present(self, data: NDArray[np.uint8]) -> BoolArray | None:
