@@ -356,8 +356,10 @@ def _may_gain_by_following(
     left = found.refined.residuals
     if not found.explained:
         return not _leaves_too_much(left)
+    if not exact:
+        return False
     parts = residuals_by_experiment(experiments, np.where(found.refined.weighted, left, 0.0))
-    return exact and any(
+    return any(
         item.creeps and _has_event(part, part != 0.0)
         for item, part in zip(experiments, parts, strict=True)
     )
